@@ -7,8 +7,7 @@ what hides in a frame at a point acts between two points.
 from pathlib import Path
 
 from workbench.draw.trials import plot_confusion
-from workbench.trials.hold import draw_kinds, hold_one, processor_times
-from workbench.trials.make import OUTSIDE_KINDS
+from workbench.trials.hold import RARE_KINDS, draw_kinds, hold_one, processor_times
 from workbench.trials.scoring import tally
 
 SINGLES, PAIRS, QUIET, SEED = 13, 4, 4, 985311  # of each structure
@@ -16,7 +15,7 @@ SINGLES, PAIRS, QUIET, SEED = 13, 4, 4, 985311  # of each structure
 
 def cases_on(structure, seed):
     """The trials on plates, or on frames: what hides in each, and its seed."""
-    drawn = [kinds for kinds in draw_kinds(60, seed, structure=structure) if not set(kinds) & set(OUTSIDE_KINDS)]
+    drawn = [kinds for kinds in draw_kinds(60, seed, structure=structure) if not set(kinds) & set(RARE_KINDS)]
     singles, pairs = ([kinds for kinds in drawn if len(kinds) == n] for n in (1, 2))
     each = [*singles[:SINGLES], *pairs[:PAIRS], *[()] * QUIET]
     seeds = [*range(SINGLES), *range(13, 13 + PAIRS), *range(17, 17 + QUIET)]

@@ -16,8 +16,8 @@ from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import simulate
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
-from workbench.trials.hold import draw_kinds
-from workbench.trials.make import KINDS, make_trial
+from workbench.trials.hold import COMMON_KINDS, draw_kinds
+from workbench.trials.make import make_trial
 
 SEED = 70000
 FAMILIES = {"single": (1, 18, 10.0), "pair": (2, 9, 30.0)}  # effects that hide, cases, limit in s
@@ -85,7 +85,9 @@ def study(outcome, data=None) -> None:
     taken: dict[str, list[float]] = {}
     over: dict[str, dict[str, float]] = {}
     for family, (n_effects, n_cases, limit) in FAMILIES.items():
-        drawn = [(SEED + i, kinds) for i, kinds in hidden if len(kinds) == n_effects and set(kinds) <= set(KINDS)]
+        drawn = [
+            (SEED + i, kinds) for i, kinds in hidden if len(kinds) == n_effects and set(kinds) <= set(COMMON_KINDS)
+        ]
         chosen = outcome.track(drawn[:n_cases], f"{family} cases")
         taken[family] = sorted(seconds_of(kinds, seed) for seed, kinds in chosen)
         median, longest = float(np.median(taken[family])), taken[family][-1]

@@ -170,6 +170,7 @@ def test_limits_that_are_not_positive_are_refused(field):
 
 
 def test_a_late_or_biased_port_has_no_state_space():
+    assert Actuator("F1", 2.0, crosstalk=(("F2", 0.1),)).has_state_space
     assert Actuator("F1", 2.0).has_state_space and Sensor("d", 1.0, crosstalk=(("v", 0.1),)).has_state_space
     assert not Actuator("F1", 2.0, bias=1.0).has_state_space
     assert not Actuator("F1", 2.0, rate_limit=1.0).has_state_space
@@ -219,3 +220,57 @@ def test_a_rig_is_refused_whose_element_or_patch_reaches_outside(square_plate):
         Rig(beam, (piezo_patch("P", 9.9, length=0.6),), ())
     with pytest.raises(PlaceError, match=r"sensor s: a slope or moment on a plate is about an axis"):
         Rig(modes, (), (Sensor("s", (0.3, 0.4), "slope"),))
+
+
+ACTING = {
+    "ideal": ({}, {}),
+    "late": ({"delay": 0.13, "time_constant": 0.05}, {"delay": 0.04, "bias": 0.1}),
+    "nonlinear": ({"dead_zone": 0.2, "gain": 1.3, "limit": 1.0}, {"hysteresis_share": 0.4, "hysteresis_width": 0.5}),
+    "slow": ({"rate_limit": 5.0}, {"rate_limit": 8.0, "delay": 0.02}),
+}
+
+
+@pytest.mark.parametrize("hold", ["zero", "first", "band-limited"])
+@pytest.mark.parametrize("acting", ACTING)
+@pytest.mark.parametrize("elements", [(), (CubicSpring(4.0, 0.3),)], ids=["linear", "stepped"])
+def test_cross_talk_adds_a_share_of_another_command(elements, acting, hold):
+    """Before all else that an actuator does to its command; exactly as if the commands were mixed by hand."""
+    plain = rig(*(Actuator(f"F{i + 1}", x, **ACTING[acting][i]) for i, x in enumerate((2.0, 6.3))), elements=elements)
+    leaking = replace(
+        plain,
+        actuators=tuple(
+            replace(a, crosstalk=((other, share),))
+            for a, other, share in zip(plain.actuators, ("F2", "F1"), (0.3, -0.2), strict=True)
+        ),
+    )
+    inputs = drive(120)
+    inputs.flags.writeable = False  # as of a record, whose drives are cached
+    mixed = inputs + np.array([[0.3], [-0.2]]) * inputs[::-1]
+    for _ in range(2):
+        mine, peer, without = (
+            simulate(r, u, sample_time=DT, input_hold=hold).outputs
+            for r, u in ((leaking, inputs), (plain, mixed), (plain, inputs))
+        )
+        np.testing.assert_allclose(mine, peer, atol=1e-12 * np.abs(peer).max())
+        assert np.abs(mine - without).max() > 0.01 * np.abs(peer).max()
+
+
+def test_cross_talk_of_no_share_changes_nothing():
+    plain = rig()
+    none = replace(plain, actuators=(replace(plain.actuators[0], crosstalk=(("F2", 0.0),)), plain.actuators[1]))
+    np.testing.assert_array_equal(*(simulate(r, drive(), sample_time=DT).outputs for r in (plain, none)))
+
+
+def test_cross_talk_is_refused_where_there_is_no_command():
+    def simulated(*actuators):
+        return simulate(rig(*actuators), drive(20), sample_time=DT)
+
+    leaking, tap = Actuator("F1", 2.0, crosstalk=(("tap", 0.1),)), Actuator("tap", 6.3, direct=True)
+    with pytest.raises(ValueError, match="F1 takes a share of the command of 'tap', which is no actuator of the rig"):
+        simulated(leaking, Actuator("F2", 6.3))
+    with pytest.raises(ValueError, match="F1 takes a share of the command of 'tap', which is a measured force"):
+        simulated(leaking, tap)
+    with pytest.raises(ValueError, match="tap is a measured force, which takes no share of a command"):
+        replace(tap, crosstalk=(("F1", 0.1),))
+    with pytest.raises(ValueError, match="F1: the share of the command of F2 must be finite; got nan"):
+        Actuator("F1", 2.0, crosstalk=(("F2", np.nan),))

@@ -122,3 +122,22 @@ def test_crosstalk_is_a_matrix_product(modes):
 def test_names_with_a_point_are_such_as_python_control_allows(modes):
     system = state_space(modes, [Actuator("F 1", 0.4)], [Sensor("Acc. A", 0.7, time_constant=0.01)])
     assert system.output_labels == ["Acc_ A"] and system.input_labels == ["F 1"]
+
+
+def test_crosstalk_of_actuators_mixes_the_commands(modes):
+    """Before gains and lags, which differ: as the simulation has it."""
+    drive = (
+        Actuator("F", 0.4, gain=2.0, time_constant=0.01, crosstalk=(("M", 0.3), ("G", -0.1))),
+        Actuator("M", 1.3, quantity="moment", gain=0.5, crosstalk=(("F", 0.2),)),
+        Actuator("G", 0.9, time_constant=0.03),
+    )
+    sensors, dt = (Sensor("y", 0.9), Sensor("a", 1.1, "acceleration")), 0.002
+    inputs = np.random.default_rng(1).standard_normal((3, 200))
+    system = control.c2d(state_space(modes, drive, sensors), dt)
+    peer = control.forced_response(system, inputs=inputs, timepts=dt * np.arange(200)).outputs
+    mine = simulate(Rig(modes, drive, sensors), inputs, sample_time=dt).outputs
+    np.testing.assert_allclose(mine, peer, atol=1e-9 * np.abs(peer).max())
+    with pytest.raises(ValueError, match="F takes a share of the command of 'M', which is no actuator of the rig"):
+        state_space(modes, [drive[0]], sensors)
+    with pytest.raises(ValueError, match="F takes a share of the command of M, and a design has no cross-talk"):
+        input_matrix(modes, drive)

@@ -55,6 +55,7 @@ FAULTS = {
     "lag of two samples": effect("actuator_lag", "all", time_constant=2.0 * DT),
     "dead zone": effect("actuator_dead_zone", "all", width=0.3),
     "gain of an actuator": effect("actuator_gain", "F1", gain=0.6),
+    "cross-talk of actuators": effect("actuator_crosstalk", ("F1", "F2"), share=0.5),
     "gain of a sensor": effect("sensor_gain", "d2", gain=1.5),
     "offset of a sensor": effect("sensor_bias", "d2", bias=0.05),
 }
@@ -91,6 +92,9 @@ def test_at_least_half_of_what_a_fault_costs_is_won_back(rig, controller, fault)
     assert found.steps[0].loss > 0.03
     assert kept[-1].loss < 0.5 * found.steps[0].loss
     assert found.safe and "stable on 4 of 4 Monte Carlo samples" in found.sentence
+    assert any(note.startswith("The cross-talk between actuators is undone") for note in found.notes) == (
+        fault == "cross-talk of actuators"
+    )
 
 
 def test_a_dead_zone_is_made_up_for_though_it_spills_less(rig):

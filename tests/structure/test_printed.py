@@ -56,6 +56,8 @@ def test_a_rig_shows_what_differs_from_the_defaults(rig):
     assert text[2].endswith(f"  0.5  {actuator}")
     assert text[3].split() == ["y", "sensor", "displacement", "1.5"]
     assert text[4].endswith("  noise std 0.001 m/s, crosstalk 0.1 of y, shape error")
+    leaking = wb.Actuator("G", 0.7, crosstalk=(("F", -0.2),))
+    assert str(replace(rig, actuators=[rig.actuators[0], leaking])).splitlines()[3].endswith("  crosstalk -0.2 of F")
     shapes = PointShapes(np.array([[1.0], [0.5]]))
     modes = Modes(omega=[2.0], damping=[[0.1]], shapes=shapes, domain=NamedPoints(("P1", "P2")))
     lagging = wb.Actuator("F", "P1", time_constant=0.02)

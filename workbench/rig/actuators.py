@@ -1,10 +1,11 @@
 """Actuators: from a command to a force or a moment, with their imperfections."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from workbench.arrays import Floats
 from workbench.renamed import Renamed, former_arguments
 from workbench.structure.domain import Between, Patch, Place, PlaceError, Where, centred_at, same_place
 from workbench.structure.printed import Constructed
@@ -14,7 +15,8 @@ from workbench.structure.printed import Constructed
 class Actuator(Constructed):
     """An actuator that exerts a force or a moment.
 
-    A command u passes hysteresis, gain, dead zone, saturation, rate limit, delay, lag and bias, in that order.
+    A command u passes cross-talk, hysteresis, gain, dead zone, saturation, rate limit, delay, lag and bias, in that
+    order.
 
     Attributes:
         name: of the input.
@@ -34,6 +36,7 @@ class Actuator(Constructed):
             unchanged.
         direction: of the force, or the axis of the moment, where the structure has more than one at a place.
         shape_error: (n_modes,) error of each mode shape, or of its slope, at this place; empty for none.
+        crosstalk: (name, share) of other inputs whose commands are added.
     """
 
     name: str
@@ -51,6 +54,7 @@ class Actuator(Constructed):
     bias: float = 0.0
     direction: str | None = None
     shape_error: tuple[float, ...] = ()
+    crosstalk: tuple[tuple[str, float], ...] = ()
 
     kind, linear = Renamed("quantity"), Renamed("has_state_space")
 
@@ -68,6 +72,13 @@ class Actuator(Constructed):
         for name in ("limit", "rate_limit", "hysteresis_width"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"actuator {self.name}: {name} must be positive; got {getattr(self, name)}")
+        for name, share in self.crosstalk:
+            if not np.isfinite(share):
+                raise ValueError(
+                    f"actuator {self.name}: the share of the command of {name} must be finite; got {share}"
+                )
+        if self.direct and self.crosstalk:
+            raise ValueError(f"actuator {self.name} is a measured force, which takes no share of a command")
 
     @property
     def has_state_space(self) -> bool:
@@ -77,6 +88,45 @@ class Actuator(Constructed):
 
 
 Actuator.__init__ = former_arguments(kind="quantity")(Actuator.__init__)  # type: ignore[method-assign]
+
+
+def mixed(actuators: Sequence[Actuator], commands: Floats) -> Floats:
+    """Commands (n_actuators, n_samples) with cross-talk; the same array if there is none.
+
+    Raises:
+        ValueError: a share of a command that is not among these, or of a measured force.
+    """
+    if not any(actuator.crosstalk for actuator in actuators):
+        return commands
+    names, taken = [actuator.name for actuator in actuators], commands.copy()
+    for j, actuator in enumerate(actuators):
+        for name, share in actuator.crosstalk:
+            if name not in names:
+                raise ValueError(
+                    f"actuator {actuator.name} takes a share of the command of {name!r}, which is no actuator of the"
+                    " rig"
+                )
+            if actuators[names.index(name)].direct:
+                raise ValueError(
+                    f"actuator {actuator.name} takes a share of the command of {name!r}, which is a measured force"
+                    " without a command"
+                )
+            taken[j] += share * commands[names.index(name)]
+    return taken
+
+
+def mixing(actuators: Sequence[Actuator]) -> Floats:
+    """Cross-talk as a matrix (n_actuators, n_actuators): the command that each actuator takes per command sent.
+
+    Raises:
+        ValueError: as of `mixed`.
+    """
+    return mixed(actuators, np.eye(len(actuators)))
+
+
+def without_crosstalk(actuators: Sequence[Actuator]) -> tuple[Actuator, ...]:
+    """The actuators, each with its own command alone."""
+    return tuple(replace(a, crosstalk=()) if a.crosstalk else a for a in actuators)
 
 
 def force_unit(actuator: Actuator) -> str:

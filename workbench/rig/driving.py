@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 
 from workbench.arrays import Complexes, Flags, Floats
 from workbench.records.band_limited import finer
-from workbench.rig.actuators import Actuator
+from workbench.rig.actuators import Actuator, mixed
 from workbench.rig.elements import PeriodicForce
 from workbench.rig.force_laws import hysteresis
 from workbench.rig.linear import propagators, shifted, whole_samples
@@ -28,7 +28,12 @@ R = TypeVar("R")
 
 
 def actuator_force(actuator: Actuator, command: np.ndarray) -> np.ndarray:
-    """The static force of an actuator: hysteresis, gain, dead zone, saturation, before rate limit, delay and lag."""
+    """The static force of an actuator: hysteresis, gain, dead zone, saturation, before rate limit, delay and lag.
+
+    Args:
+        actuator: of the force.
+        command: (n_samples,) with its cross-talk.
+    """
     if actuator.hysteresis_share:
         share = actuator.hysteresis_share
         hysteretic = hysteresis(np.r_[0.0, command], actuator.hysteresis_width)[1:]
@@ -182,7 +187,7 @@ def drives(
     rise = np.zeros_like(mean)  # half of it, over a substep
     at_samples = np.empty_like(inputs)
     nonlinear = []
-    given = finer(inputs, substeps) if input_hold == "band-limited" else inputs
+    given = mixed(actuators, finer(inputs, substeps) if input_hold == "band-limited" else inputs)
     for j, actuator in enumerate(actuators):
         force = actuator_force(actuator, given[j])
         if input_hold == "zero":

@@ -8,6 +8,7 @@ import numpy as np
 from workbench.arrays import Complexes, Floats
 from workbench.records.band_limited import finer
 from workbench.records.record import Record
+from workbench.rig.actuators import mixed
 from workbench.rig.driving import actuator_force, drives, motion_correction, on_finer_steps, sinusoid_on_substeps
 from workbench.rig.elements import PeriodicForce, RandomForce
 from workbench.rig.lanes import on_lanes
@@ -123,7 +124,7 @@ def _move_exactly(
     With held inputs, at every sample.
     """
     modes, participation = rig.modes, participation_of(rig)
-    system = _poles(modes)
+    system, inputs = _poles(modes), mixed(rig.actuators, inputs)
     responses: list[Complexes] = []
     acting = np.zeros((inputs.shape[0], inputs.shape[1] // every))
     response_to = held_response if input_hold == "zero" else partial(straight_response, every=every)
@@ -170,7 +171,11 @@ def _steps_within(
     """Steps of the modal forces within each sample interval, of held inputs that are delayed or lagged.
 
     Args:
+        rig: has the actuators.
+        inputs: (n_actuators, n_samples) commands with cross-talk.
         acting: (n_actuators, n_samples) forces at the samples, without bias.
+        participation: (n_modes, n_actuators or more).
+        sample_time: s.
     """
     steps: dict[tuple[float, float], Floats] = {}
     for j, actuator in enumerate(rig.actuators):
@@ -199,7 +204,8 @@ def _move_in_steps(rig: Rig, inputs: Floats, sample_time: float, substeps: int, 
     held: Floats | float = 0.0
     if input_hold == "zero":
         acting, bias = at_samples[:n_inputs], np.array([actuator.bias for actuator in rig.actuators])
-        steps = _steps_within(rig, inputs, acting - bias[:, None], participation, sample_time)
+        taken = mixed(rig.actuators, inputs)
+        steps = _steps_within(rig, taken, acting - bias[:, None], participation, sample_time)
         held = participation[:, :n_inputs] @ acting
     recomputed = None
     if substeps > 1 and (rig.elements or input_hold == "band-limited" or rig.is_rate_limited):

@@ -7,7 +7,7 @@ import control
 import numpy as np
 
 from workbench.arrays import Floats
-from workbench.rig.actuators import Actuator
+from workbench.rig.actuators import Actuator, mixing
 from workbench.rig.rig import shape_of
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.modes import Modes
@@ -29,8 +29,19 @@ def input_matrix(modes: Modes, actuators: Sequence[Actuator]) -> np.ndarray:
     """Modal forces per unit command (n_modes, n_actuators): gain times φ_r at the place, or its slope for a moment.
 
     Raises:
-        ValueError: an actuator on a support, where it does no work.
+        ValueError: an actuator on a support, where it does no work, or with cross-talk, which no design includes.
     """
+    leaking = next((actuator for actuator in actuators if actuator.crosstalk), None)
+    if leaking is not None:
+        raise ValueError(
+            f"actuator {leaking.name} takes a share of the command of {leaking.crosstalk[0][0]}, and a design has no"
+            " cross-talk of actuators: leave it out; wb.redesign then undoes it on the commands"
+        )
+    return _input_matrix(modes, actuators)
+
+
+def _input_matrix(modes: Modes, actuators: Sequence[Actuator]) -> Floats:
+    """The same without cross-talk."""
     columns = []
     for actuator in actuators:
         shape = shape_of(modes, actuator)
@@ -53,12 +64,12 @@ def state_space(modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[S
     """The linear model from commands to sensor outputs, states (q_1..q_n, q_1'..q_n'), named signals.
 
     x' = [0 I; -Ω² -C] x + [0; B] u, and y a displacement, slope, velocity, angular velocity or acceleration. For an
-    acceleration D is not zero. Cross-talk of sensors is included. Lags of actuators, then of sensors, add one state
-    each after the modal ones.
+    acceleration D is not zero. Cross-talk is included. Lags of actuators, then of sensors, add one state each after the
+    modal ones.
 
     Raises:
         ValueError: an actuator or sensor that is not linear (dead zone, limit, bias, rounding) or has a delay, and
-            cross-talk from a sensor that is not among these.
+            cross-talk from a sensor or an actuator that is not among these.
     """
     parts: tuple[Actuator | Sensor, ...] = (*actuators, *sensors)
     for part in parts:
@@ -103,14 +114,15 @@ def modal_plant(
 ) -> tuple[Floats, Floats, Floats, Floats, list[str]]:
     """A, B, C, D and the names of the states, from commands to readings and to the delayed and lagged commands.
 
-    Lags and delays are included, a delay as of `delay_line`; nonlinear imperfections are not, and cross-talk of sensors
-    where it is asked for. The last n_actuators rows of C and D give the delayed and lagged commands, before the gains.
+    Lags and delays are included, a delay as of `delay_line`; nonlinear imperfections are not, and cross-talk where it
+    is asked for. The last n_actuators rows of C and D give the delayed and lagged commands, before the gains.
 
     Raises:
-        ValueError: cross-talk from a sensor that is not among these.
+        ValueError: cross-talk from a sensor or an actuator that is not among these; cross-talk of actuators, where
+            none is asked for.
     """
     n, m = modes.n_modes, len(actuators)
-    force = input_matrix(modes, actuators)
+    force = _input_matrix(modes, actuators) if with_crosstalk else input_matrix(modes, actuators)
     a, b = modes.state_matrix, np.vstack([np.zeros_like(force), force])
 
     def read(sensors: Sequence[Sensor]) -> tuple[Floats, Floats]:
@@ -145,6 +157,8 @@ def modal_plant(
             b, c = np.vstack([b, np.outer(pb, d[j])]), np.hstack([c, np.zeros((len(c), size))])
             c[j], d[j] = np.r_[np.zeros(len(a) - size), pc], 0.0
             states += _named(f"{sensor.name}_{what}", size)
+    if any(actuator.crosstalk for actuator in actuators):
+        b, d = b @ mixing(actuators), d @ mixing(actuators)
     return a, b, c, d, states
 
 

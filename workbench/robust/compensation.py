@@ -6,7 +6,8 @@ With X = (x, a) the controlled modes and the forces of lagging actuators, and v 
 
 is solved exactly between samples. The estimate at a sample is predicted ahead by each actuator's delay and half a
 sample, with the delayed commands (a Smith predictor), and a lag is inverted: v = w + λ w', w = -K x. Delays and lags of
-sensors enter by their readings of each mode at its frequency, H_j(iω_r) (c_q + iω_r c_v).
+sensors enter by their readings of each mode at its frequency, H_j(iω_r) (c_q + iω_r c_v). Commands are sent through the
+inverse of the actuators' cross-talk.
 """
 
 from collections.abc import Sequence
@@ -28,8 +29,8 @@ from workbench.design.estimation.observers import observed_plant
 from workbench.design.export.sampled_loop import MOST_PAST, held, held_over, past_commands
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.laws.on_off import OnOffLaw
-from workbench.design.loop.rig_loop import named
-from workbench.rig.actuators import Actuator
+from workbench.design.loop.rig_loop import driven, named
+from workbench.rig.actuators import Actuator, mixing
 from workbench.rig.elements import CoulombFriction
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
@@ -37,6 +38,7 @@ from workbench.robust.small_motion import crosstalk, lag_response, late_output
 from workbench.structure.modes import Modes
 
 STEPS = ("sensors", "delay", "dead zone", "saturation", "friction")  # compensations, in this order
+MIXED_ALIKE = 1e6  # condition number of the cross-talk above which it counts as singular
 SLOWEST = 4.0  # least samples per period of a controlled mode
 
 
@@ -101,16 +103,19 @@ def compensated(rig: Rig, loop: Loop, sample_time: float, steps: Sequence[str] =
     """The digital controller of a law and its estimator on a rig, with the given compensations.
 
     Args:
-        rig: corrected; its actuators and sensors have the names of the law's and the estimator's.
+        rig: corrected; its actuators and sensors have the names of the law's and the estimator's. Cross-talk of its
+            actuators is always undone, as their gain is in the law.
         loop: designed for the rig.
         sample_time: s.
         steps: of `STEPS`; "sensors" corrects gain, offset and cross-talk, and includes delays and lags in the model.
 
     Raises:
-        DesignError: a rate too slow for the modes, or too fast for an actuator's delay.
+        DesignError: a rate too slow for the modes, or too fast for an actuator's delay; cross-talk that cannot be
+            undone.
+        ValueError: cross-talk into an actuator that the law does not drive.
     """
     check_rate(loop.modes, loop.law.controlled, sample_time)
-    actuators = [named(rig.actuators, a.name) for a in loop.law.actuators]
+    actuators = driven(rig, [a.name for a in loop.law.actuators])
     sensors = [named(rig.sensors, s.name) for s in loop.controller.sensors]
     own, forced, reads = observed_plant(loop.modes, loop.controller.law, loop.controller.sensors)
     model = _model(own, forced, actuators, sample_time, "delay" in steps)
@@ -139,9 +144,39 @@ def compensated(rig: Rig, loop: Loop, sample_time: float, steps: Sequence[str] =
         parts["relays"] = Relays(loop.law.spread, _values(relays, "force"), _values(relays, "dead_band"))
     if "friction" in steps:
         parts["friction"] = _friction(rig, loop, forced, estimator, len(a))
+    if any(x.crosstalk for x in actuators):
+        c, d, e, parts = _through_crosstalk(actuators, c, d, e, parts)
     names = tuple(s.name for s in sensors), tuple(x.name for x in actuators)
     parts |= {"name": loop.controller.name, "states": _states(model, loop, names[1])}
     return DigitalController(sample_time, *names, a, b, c, d, e, **parts)
+
+
+def _through_crosstalk(
+    actuators: Sequence[Actuator], c: Floats, d: Floats, e: Floats, parts: dict[str, Any]
+) -> tuple[Floats, Floats, Floats, dict[str, Any]]:
+    """C, D, E and other parts of a digital controller that sends its commands through the inverse of the cross-talk.
+
+    Limits and dead zones stay those of each actuator's own command.
+
+    Raises:
+        DesignError: cross-talk without an inverse.
+    """
+    mix = mixing(actuators)
+    if np.linalg.cond(mix) > MIXED_ALIKE:
+        raise DesignError(
+            f"the cross-talk between {', '.join(x.name for x in actuators)} makes them act alike, so it cannot be"
+            " undone: control with fewer of them"
+        )
+    undone, parts = np.linalg.inv(mix), dict(parts)
+    if "relays" in parts:
+        parts["relays"] = replace(parts["relays"], spread=undone @ parts["relays"].spread)
+    else:
+        c, d = undone @ c, undone @ d
+    if "bias" in parts:
+        parts["bias"] = undone @ parts["bias"]
+    if parts.get("friction") is not None:
+        parts["friction"] = replace(parts["friction"], push=undone @ parts["friction"].push)
+    return c, d, e @ mix, parts
 
 
 def _values(parts: Sequence[object], name: str) -> np.ndarray:

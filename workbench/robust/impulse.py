@@ -111,6 +111,6 @@ def impulse_speeds(
         at: the place; None for that of the actuator.
         actuator: in whose direction the impulse then acts.
     """
-    shape = input_matrix(modes, [replace(actuator, gain=1.0)])[:, 0] if at is None else modes.phi_at(at)
+    shape = input_matrix(modes, [replace(actuator, gain=1.0, crosstalk=())])[:, 0] if at is None else modes.phi_at(at)
     speeds = np.abs(impulse * shape[list(index)])
     return np.asarray(np.maximum(speeds, 0.1 * speeds.max()))

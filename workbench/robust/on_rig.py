@@ -17,7 +17,7 @@ from workbench.design.laws.law import DesignError, Law, separation
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.rig_loop import LoopTest, named
 from workbench.design.placement.task import PlacementTask
-from workbench.rig.actuators import Actuator
+from workbench.rig.actuators import Actuator, without_crosstalk
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.statespace import output_matrix
@@ -60,7 +60,7 @@ def loop_on_rig(rig: Rig, design: Design, test: LoopTest) -> Loop:
         DesignError: a sensor or an actuator that the rig does not have, or a gain given by hand.
     """
     if isinstance(design, PlacementTask):
-        actuators = [a for a in rig.actuators if not a.direct]
+        actuators = without_crosstalk([a for a in rig.actuators if not a.direct])
         design = imsc(rig.modes, design.n_controlled, actuators, weight=design.weight)
     law = law_of(design)
     if law.designed_by is None:
@@ -68,7 +68,7 @@ def loop_on_rig(rig: Rig, design: Design, test: LoopTest) -> Loop:
             f"{law.name} was given by its gain, so its design cannot be repeated for another structure: make it by"
             " imsc, imsc_poles, coupled_lqr, coupled_poles or on_off"
         )
-    law = replace(law, actuators=tuple(_same_actuator(rig, a) for a in law.actuators))
+    law = replace(law, actuators=without_crosstalk([_same_actuator(rig, a) for a in law.actuators]))
     if isinstance(design, Controller):
         if design.designed_by is None:
             raise DesignError(
@@ -179,7 +179,7 @@ def redesigned_for(loop: Loop, rig: Rig, modes: Modes, removed: Sequence[str] = 
         DesignError: modes that cannot be controlled or observed on that rig.
     """
     controlled = paired(loop.modes, modes, loop.law.controlled)
-    actuators = [named(rig.actuators, one.name) for one in loop.law.actuators]
+    actuators = without_crosstalk([named(rig.actuators, one.name) for one in loop.law.actuators])
     assert loop.law.designed_by is not None and loop.controller.designed_by is not None
     if isinstance(loop.law, OnOffLaw):
         modes = replace(modes, damping=np.diag(np.diag(modes.damping)))

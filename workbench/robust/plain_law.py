@@ -8,6 +8,7 @@ from workbench.design.laws.coupled import coupled_lqr, coupled_poles
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError, Law, controlled_indices
 from workbench.design.laws.on_off import OnOffLaw, on_off
+from workbench.rig.actuators import without_crosstalk
 from workbench.rig.rig import Rig
 from workbench.rig.statespace import input_matrix
 from workbench.robust.impulse import impulse_speeds
@@ -43,7 +44,7 @@ def plain_law(
     Raises:
         DesignError: an unknown kind, no actuator, or a damping ratio out of range.
     """
-    actuators = [a for a in rig.actuators if not a.direct]
+    actuators = without_crosstalk([a for a in rig.actuators if not a.direct])
     if not actuators:
         raise DesignError("the rig has no actuator to control with, only measured forces; add one")
     if not 0 < damping < 1:

@@ -1,6 +1,7 @@
 """Redesign of a controller for a diagnosed structure, step by step, with Monte Carlo verification."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from workbench.design.loop.rig_loop import LoopTest, run_loop
 from workbench.gap.report.verdict import Verdict
 from workbench.records.units import SI, Units
 from workbench.renamed import former_arguments
+from workbench.rig.actuators import without_crosstalk
 from workbench.rig.rig import Rig
 from workbench.robust.advice import MORE_COST, Redesign
 from workbench.robust.compensation import Loop, check_rate, compensated
@@ -157,7 +159,7 @@ def _check_wanted(criterion: str | None, more_cost: float, more_work: float) -> 
 def _present(rig: Rig, loop: Loop, sample_time: float) -> DigitalController:
     """The controller in use, designed for the nominal rig, without compensation."""
     if isinstance(loop.law, OnOffLaw):
-        return compensated(rig, loop, sample_time, ())
+        return compensated(replace(rig, actuators=without_crosstalk(rig.actuators)), loop, sample_time, ())
     return sampled(loop.controller, sample_time)
 
 
@@ -175,6 +177,11 @@ def _notes(uncertain: UncertainRig, rig: Rig, draws: int, *, as_wanted: bool) ->
         notes.append(
             "Even with perfect actuators and sensors the controlled modes do not settle within the test, so the"
             " controllers are judged by vibration and effort; give a longer test to judge them by settling."
+        )
+    if any(a.crosstalk for a in rig.actuators):
+        notes.append(
+            "The cross-talk between actuators is undone on the commands, but for the part that a limit or a dead zone"
+            " of an actuator takes."
         )
     if any(a.hysteresis_share for a in rig.actuators):
         notes.append("The hysteresis of an actuator is in the verification, but is not compensated.")

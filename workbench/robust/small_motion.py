@@ -9,7 +9,8 @@ from scipy.optimize import minimize_scalar
 from workbench.design.estimation.controller import reading
 from workbench.design.estimation.digital import DigitalController
 from workbench.design.export.sampled_loop import closed_by, held, linear_plant
-from workbench.design.loop.rig_loop import LoopRun, named
+from workbench.design.loop.rig_loop import LoopRun, driven, named
+from workbench.rig.actuators import mixing
 from workbench.rig.elements import PointElement
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
@@ -88,10 +89,10 @@ def loop_poles(rig: Rig, controller: DigitalController, modes: Modes | None = No
 
 def _closed(rig: Rig, controller: DigitalController, modes: Modes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A, B and C of the closed loop, as of `closed_by`: z ← A z + B e, reading C z + e."""
-    actuators = [named(rig.actuators, name) for name in controller.actuators]
+    actuators = driven(rig, controller.actuators)
     a, b, _ = linear_plant(modes, actuators, ())
     stepped, into = held(a, b, controller.sample_time, np.array([x.delay for x in actuators]))
-    return closed_by(stepped, into, _output(rig, controller, modes, len(stepped)), controller)
+    return closed_by(stepped, into @ mixing(actuators), _output(rig, controller, modes, len(stepped)), controller)
 
 
 def _output(rig: Rig, controller: DigitalController, modes: Modes, total: int) -> np.ndarray:

@@ -322,7 +322,7 @@ DRAWS: dict[str, Draw] = {
     "periodic_disturbance": _periodic_force,
     "random_disturbance": _random_force,
     "stiffness_drift": _drift,
-    "cross_talk": _actuator_crosstalk,
+    "actuator_crosstalk": _actuator_crosstalk,
     "bent_command": lambda c, rng: lambda s: {"curvature": 0.2 * s / _rms(c.commands[0])},
     "bent_reading": _reading("curvature", lambda c, y, x: 0.2 * x / y.std(), signed=True),
     "hum": _hum,

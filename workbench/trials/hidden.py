@@ -152,12 +152,12 @@ HIDE: dict[str, Hide] = {
     ),
     "random_disturbance": lambda p, e: replace(p, noises=(*p.noises, (stands(e), e["rms"], e["corner"]))),
     "stiffness_drift": lambda p, e: replace(p, stiffness_rate=e["rate"]),
+    "actuator_crosstalk": _actuator_crosstalk,
 }
 
 # Kinds outside every catalogue of the diagnosis: the right verdict on them is "unknown".
 OUTSIDE: dict[str, Hide] = {
     **{name: partial(_law, law) for name, law in POINT_LAWS.items() if law.outside},
-    "cross_talk": _actuator_crosstalk,
     "bent_command": _bent_command,
     "bent_reading": _reading(lambda y, sample_time, e: e["curvature"] * y[e["output"]] ** 2),
     "hum": _reading(_hum),

@@ -14,6 +14,8 @@ NEAR = 0.02  # largest error of a place that counts as right, over the length
 NEAR_IF_IMPERFECT = 0.03  # the same for trials with imperfections
 HONEST = 0.05  # largest error of the unexplained share of a budget that counts as right
 NORMAL_95 = 1.96  # standard deviations on each side of a 95 % interval
+# kinds outside every catalogue when trials were sealed, and the effects that they have since become
+NAMED_SINCE = {"cross_talk": "actuator_crosstalk"}
 BINS = 5  # of a reliability diagram, of equal width
 
 
@@ -58,14 +60,16 @@ def score(
         inputs, outputs: names in order, needed if a label has indices from zero.
 
     Returns:
-        {"hidden", "diagnosed": sets of kinds as text; "family": single, pair, none or unknown; "kinds": whether right;
+        {"hidden", "diagnosed": sets of kinds as text; "family": single, pair, none or unknown; "kinds": whether right,
+        of an effect outside the catalogue that has since entered it also by its name;
         "channels": whether inputs and outputs are right, None without any; "position_errors": over the length or
         diagonal, 1 for another named point; "positions": whether right, None without any; "shrinkage": by validation
         record}.
     """
     hidden = _hidden(label, inputs, outputs)
     named = verdict["effects"]
-    kinds = sorted(e["kind"] for e in hidden) == sorted(e["kind"] for e in named)
+    since = [NAMED_SINCE.get(e.get("outside", ""), e["kind"]) for e in hidden]
+    kinds = sorted(e["kind"] for e in named) in (sorted(e["kind"] for e in hidden), sorted(since))
     pairs = [(hidden[i], named[j]) for i, j in sorted(_pairs(hidden, named, domain))] if kinds else []
     channels = [_same_channel(h, t) for h, t in pairs if "input" in h or "output" in h]
     errors = [_off(h, t, domain) for h, t in pairs if stands(h) is not None and stands(t) is not None]

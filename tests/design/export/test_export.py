@@ -299,3 +299,17 @@ def test_a_slow_actuator_is_in_the_margin_of_continuous_time():
     true = control.feedback(state_space(modes, [drive], sensors), control.ss(*parts), sign=1).poles().real.max()
     found = sample_design(modes, controller, sample_rate_hz=2000.0)
     assert true < 0 and f"{-true:.3g} 1/s in continuous time" in found.remarks[0]
+
+
+def test_the_sampled_loop_has_the_cross_talk_of_actuators(modes, observer):
+    """It precedes their delays, which differ: as a controller whose commands are mixed by hand."""
+    digital = export(modes, observer, sample_rate_hz=RATE).controller
+    late = [replace(a, delay=delay / RATE) for a, delay in zip(ACTUATORS, (0.4, 1.3), strict=True)]
+    leaking = [replace(late[0], crosstalk=(("F2", 0.3),)), replace(late[1], crosstalk=(("F1", -0.2),))]
+    mix = np.array([[1.0, 0.3], [-0.2, 1.0]])
+    by_hand = replace(digital, C=mix @ digital.C, D=mix @ digital.D, E=digital.E @ np.linalg.inv(mix))
+    expected = sampled_loop(modes, late, SENSORS, by_hand)
+    np.testing.assert_allclose(
+        sampled_loop(modes, leaking, SENSORS, digital), expected, atol=1e-12 * np.abs(expected).max()
+    )
+    assert np.abs(sampled_loop(modes, late, SENSORS, digital) - expected).max() > 1e-3

@@ -8,11 +8,12 @@ import pytest
 from workbench.design.estimation.controller import Controller
 from workbench.design.estimation.digital import DigitalController, FrictionForward, sampled
 from workbench.design.estimation.observers import kalman_controller
+from workbench.design.export.sampled_loop import sampled_loop
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.closed_loop import close_with, impulse_state, initial_response
 from workbench.design.loop.rig_loop import LoopTest, run_loop
 from workbench.design.spillover.spillover import finite_spillover
-from workbench.rig.actuators import Actuator
+from workbench.rig.actuators import Actuator, without_crosstalk
 from workbench.rig.elements import AirDrag, BoucWen, CoulombFriction, CubicSpring, MidplaneStretching, UserLaw
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
@@ -67,6 +68,60 @@ def test_the_motion_is_that_of_the_commands_that_were_sent(rig, drive, laws):
     expected = simulate(real, run.commands, sample_time=DT, substeps=8).outputs[:3]
     assert run.bounded and np.abs(run.commands).max() > 1.0
     assert run.response.displacement([0.3, 0.7, 1.6]) == pytest.approx(expected, abs=2e-3 * np.abs(expected).max())
+
+
+def leaking(rig: Rig, **both) -> Rig:
+    shares = ((("F2", 0.3),), (("F1", -0.2),))
+    return replace(
+        rig, actuators=tuple(replace(a, crosstalk=each, **both) for a, each in zip(rig.actuators, shares, strict=True))
+    )
+
+
+@pytest.mark.parametrize("drive", DRIVES)
+def test_cross_talk_mixes_the_commands(rig, drive):
+    """Against the open-loop simulation, and against a controller that mixes them by hand."""
+    real, controller = leaking(rig, **DRIVES[drive]), restless(rig)
+    run = run_loop(real, controller, LoopTest(400, DT), substeps=8)
+    expected = simulate(real, run.commands, sample_time=DT, substeps=8).outputs[:3]
+    assert run.response.displacement([0.3, 0.7, 1.6]) == pytest.approx(expected, abs=2e-3 * np.abs(expected).max())
+    mix = np.array([[1.0, 0.3], [-0.2, 1.0]])
+    by_hand = replace(controller, C=mix @ controller.C, D=mix @ controller.D)
+    plain = replace(rig, actuators=tuple(replace(a, **DRIVES[drive]) for a in rig.actuators))
+    peer = run_loop(plain, by_hand, LoopTest(400, DT), substeps=8)
+    np.testing.assert_allclose(run.response.modal, peer.response.modal, atol=1e-9 * np.abs(peer.response.modal).max())
+    np.testing.assert_allclose(mix @ run.commands, peer.commands, atol=1e-9 * np.abs(peer.commands).max())
+
+
+def test_cross_talk_in_a_loop_is_that_of_the_sampled_loop(rig):
+    real, names = leaking(rig, gain=0.8, delay=1.25 * DT), ("d0", "v0", "v1")
+    sensors = [s for s in rig.sensors if s.name in names]
+    feedback = np.array([[-3.0, -2.0, 0.0], [0.0, 1.0, -3.0]])
+    empty = np.zeros((0, 0)), np.zeros((0, 3)), np.zeros((2, 0))
+    controller = DigitalController(DT, names, ("F1", "F2"), *empty, feedback, np.zeros((0, 2)))
+    run = run_loop(real, controller, LoopTest(60, DT, impulse_at=0.8))
+    state = np.zeros(sampled_loop(rig.modes, real.actuators, sensors, controller).shape[0])
+    state[:10], expected = impulse_state(rig.modes, 0.8), []
+    for _ in range(60):
+        expected.append(state[:10])
+        state = sampled_loop(rig.modes, real.actuators, sensors, controller) @ state
+    found, expected = run.response.modal, np.array(expected).T
+    np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
+    without = run_loop(
+        replace(rig, actuators=without_crosstalk(real.actuators)), controller, LoopTest(60, DT, impulse_at=0.8)
+    )
+    assert np.abs(found - without.response.modal).max() > 0.01 * np.abs(expected).max()
+
+
+def test_cross_talk_into_an_actuator_that_is_not_driven_is_refused(rig):
+    controller = restless(rig)
+    one = replace(controller, actuators=("F1",), C=controller.C[:1], D=controller.D[:1], E=controller.E[:, :1])
+    for name, there in (("limit", np.inf), ("rate", np.inf), ("dead_zone", 0.0), ("bias", 0.0)):
+        one = replace(one, **{name: np.array([there])})
+    with pytest.raises(ValueError, match="F2 takes a share of the command of F1, and the controller does not drive it"):
+        run_loop(leaking(rig), one, LoopTest(20, DT))
+    taking = replace(rig, actuators=(leaking(rig).actuators[0], rig.actuators[1]))  # from F2, which has no command
+    found, expected = (run_loop(r, one, LoopTest(20, DT)).commands for r in (taking, rig))
+    np.testing.assert_array_equal(found, expected)
 
 
 def test_what_is_read_is_what_the_sensors_read(rig):

@@ -284,6 +284,54 @@ def test_cross_talk_adds_a_share_of_another_reading():
     assert _described(effect, nominal) == "cross-talk between sensors (d from v: share 0.2)"
 
 
+def test_cross_talk_adds_a_share_of_another_command():
+    nominal, kind = rig(), kind_named("actuator_crosstalk")
+    effect = Effect(kind, ("F1", "F2"), {"share": 0.2})
+    assert kind.targets(nominal) == (("F1", "F2"), ("F2", "F1")), "a hammer has no command"
+    assert kind.targets(replace(nominal, actuators=nominal.actuators[1:])) == ()
+    mixed = drive() + np.array([[0.2], [0.0], [0.0]]) * drive()[1]
+    leaking = simulate(effect.apply(nominal), drive(), sample_time=DT).outputs
+    np.testing.assert_allclose(leaking, simulate(nominal, mixed, sample_time=DT).outputs, atol=1e-12)
+    told = effect_json(effect, nominal)
+    assert (told["input"], told["from"]) == ("F1", "F2")
+    assert _described(effect, nominal) == "cross-talk between actuators (F1 from F2: share 0.2)"
+    twice = apply_all(nominal, [effect, Effect(kind, ("F1", "F2"), {"share": 0.1})])
+    assert dict(twice.actuators[0].crosstalk) and sum(share for _, share in twice.actuators[0].crosstalk) == 0.2 + 0.1
+
+
+@pytest.mark.parametrize("swapped_first", [True, False])
+def test_cross_talk_stays_with_the_channel_where_inputs_are_exchanged(swapped_first):
+    nominal = rig()
+    effects = [
+        Effect(kind_named("swapped_inputs"), ("F1", "F2"), {}),
+        Effect(kind_named("actuator_crosstalk"), ("F1", "F2"), {"share": 0.2}),
+    ]
+    changed = apply_all(nominal, effects if swapped_first else effects[::-1])
+    mixed = (drive() + np.array([[0.2], [0.0], [0.0]]) * drive()[1])[[1, 0, 2]]
+    found, expected = simulate(changed, drive(), sample_time=DT), simulate(nominal, mixed, sample_time=DT)
+    np.testing.assert_allclose(found.outputs, expected.outputs, atol=1e-12)
+
+
+def _evidence(real: Rig, inputs: np.ndarray) -> SimpleNamespace:
+    """What is left of a record of a real rig by the nominal one."""
+    nominal = rig()
+    seen, expected = (simulate(r, inputs, sample_time=DT) for r in (real, nominal))
+    left = seen.outputs - expected.outputs
+    return SimpleNamespace(rig=nominal, data=SimpleNamespace(records=(seen,)), residuals=(left,))
+
+
+def test_cross_talk_of_actuators_starts_where_the_residual_shows_it():
+    kind, gain = kind_named("actuator_crosstalk"), kind_named("actuator_gain")
+    leaking = kind.apply(rig(), ("F1", "F2"), {"share": -0.3})
+    (start,) = kind.starts(_evidence(leaking, drive()), ("F1", "F2"))
+    assert start["share"] == pytest.approx(-0.3)
+    wrong = gain.apply(rig(), "F1", {"gain": 1.2})
+    assert list(kind.starts(_evidence(wrong, drive(6000)), ("F1", "F2"))) == []
+    alike = drive()
+    alike[1] = -0.7 * alike[0]  # the share is then a gain
+    assert list(kind.starts(_evidence(leaking, alike), ("F1", "F2"))) == []
+
+
 def test_a_number_whose_deviation_exceeds_it_does_not_stand_out():
     damper, nominal = kind_named("point_damper"), rig()
     sure = Effect(damper, None, {"at": 0.8, "coefficient": 1.0}, {"at": 0.01, "coefficient": 0.1})

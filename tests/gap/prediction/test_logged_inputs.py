@@ -19,6 +19,7 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import log_likelihood, whiten
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import CubicSpring
+from workbench.rig.rig import shape_of
 from workbench.rig.simulate import predict, simulate
 
 NOISE = 1e-5
@@ -123,3 +124,14 @@ def test_the_likelihood_is_that_of_the_whole_covariance(rig, logged):
     filters = input_filters(rig, logged, SHARE)
     # the filter starts from its steady state, the record from rest
     assert log_likelihood(filters["high"], [left]) == pytest.approx(dense, rel=2e-3)
+
+
+def test_input_noise_of_a_channel_acts_through_its_cross_talk(rig, logged):
+    """As if the actuator that it leaks from acted at both places: its shape is the sum."""
+    first, second = rig.actuators
+    shape = shape_of(rig.modes, first)
+    leaking = replace(rig, actuators=(replace(first, crosstalk=((second.name, 0.3),)), second))
+    by_shape = replace(rig, actuators=(first, replace(second, shape_error=tuple(0.3 * shape))))
+    mine, peer, without = (input_filters(r, logged, SHARE)["high"] for r in (leaking, by_shape, rig))
+    np.testing.assert_allclose(mine.innovation, peer.innovation, rtol=1e-9)
+    assert np.abs(mine.innovation - without.innovation).max() > 1e-3 * np.abs(without.innovation).max()

@@ -16,7 +16,7 @@ from scipy.linalg import expm
 from workbench.arrays import Floats, Integers
 from workbench.design.estimation.digital import DigitalController, zero_order_hold
 from workbench.design.laws.law import DesignError
-from workbench.rig.actuators import Actuator
+from workbench.rig.actuators import Actuator, mixing, without_crosstalk
 from workbench.rig.sensors import Sensor
 from workbench.rig.statespace import state_space
 from workbench.structure.modes import Modes
@@ -35,14 +35,14 @@ def sampled_loop(
 
     Args:
         modes: controlled and residual.
-        actuators: in the order of the commands; gains, lags and delays count, limits and dead zones do not.
+        actuators: in the order of the commands; gains, lags, delays and cross-talk count, limits and dead zones do not.
         sensors: in the order of the readings, likewise.
         controller: its linear part counts.
         computing_delay: from a reading to the command's first effect, beside the actuators' own delays, s.
 
     Raises:
         DesignError: a sensor with a delay, or a negative delay.
-        ValueError: cross-talk from a sensor that is not among these.
+        ValueError: cross-talk from a sensor or an actuator that is not among these.
     """
     late = [sensor.name for sensor in sensors if sensor.delay]
     if late:
@@ -53,7 +53,7 @@ def sampled_loop(
     delays = np.array([computing_delay + actuator.delay for actuator in actuators])
     stepped, into = held(a, b, controller.sample_time, delays)
     reads = np.hstack([c, np.zeros((len(c), len(stepped) - len(a)))])
-    return closed_by(stepped, into, reads, controller)[0]
+    return closed_by(stepped, into @ mixing(actuators), reads, controller)[0]
 
 
 def held(a: Floats, b: Floats, period: float, delays: Floats) -> tuple[Floats, Floats]:
@@ -125,10 +125,13 @@ def closed_by(
 def linear_plant(
     modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[Sensor]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A, B and C of the structure with the linear part of its actuators and sensors, without delays."""
+    """A, B and C of the structure with the linear part of its actuators and sensors, without delays.
+
+    Commands come after the cross-talk of the actuators, which precedes their delays.
+    """
     linear_actuators = [
         replace(a, delay=0.0, dead_zone=0.0, limit=np.inf, rate_limit=np.inf, hysteresis_share=0.0, bias=0.0)
-        for a in actuators
+        for a in without_crosstalk(actuators)
     ]
     linear_sensors = [replace(s, bias=0.0, drift=0.0, limit=np.inf, step=0.0) for s in sensors]
     plant = state_space(modes, linear_actuators, linear_sensors)

@@ -85,6 +85,7 @@ def loop_record(
     structure: Structure,
     elements: Elements,
     drive: Floats,
+    mix: Floats,
     into: Floats,
     sense: Floats,
     seen: Floats,
@@ -103,6 +104,8 @@ def loop_record(
         structure, elements: see `structure_arrays` and `law_arrays`.
         drive: (n_actuators, 9) gain, dead zone, limit, delay, time constant, bias, rate limit, share and width of
             hysteresis.
+        mix: (n_actuators, n_actuators) command that each actuator takes per command sent, its cross-talk; (0, 0) for
+            none.
         into: (n, n_actuators) participation factors.
         sense: (n_sensors, 7) gain, bias, drift per sample, delay, time constant, limit, step.
         seen: (2, n_sensors, n) output matrices of displacements and of velocities, with cross-talk.
@@ -163,7 +166,12 @@ def loop_record(
         # --- act and move
         for j in range(nu):
             f_out[j, k] = 0.0
-            target[j] = _static_force(u_out[j, k], drive, j, hyst, before)
+            taken = u_out[j, k]
+            if mix.size > 0:
+                taken = 0.0
+                for m in range(nu):
+                    taken += mix[j, m] * u_out[m, k]
+            target[j] = _static_force(taken, drive, j, hyst, before)
         for sub in range(n_sub):
             now = k * n_sub + sub
             for r in range(n_modes):

@@ -11,7 +11,7 @@ from workbench.arguments import number, whole
 from workbench.design.estimation.digital import DigitalController
 from workbench.design.loop.closed_loop import Response
 from workbench.design.loop.loop_steps import ControllerArrays, loop_record
-from workbench.rig.actuators import Actuator
+from workbench.rig.actuators import Actuator, mixing
 from workbench.rig.elements import PeriodicForce, RandomForce
 from workbench.rig.rig import Rig, participation_of, shape_of
 from workbench.rig.sensors import MEASURED, Sensor
@@ -115,12 +115,13 @@ def run_loop(
         free: samples after the test without noise, forces of the test, or disturbances of the rig.
 
     Raises:
-        ValueError: sensors or actuators that the rig does not have, another sample time, or an accelerometer.
+        ValueError: sensors or actuators that the rig does not have, another sample time, an accelerometer, or
+            cross-talk into an actuator that the controller does not drive.
     """
     check_fits(rig, controller, test)
     modes, n = rig.modes, rig.modes.n_modes
     sensors = [named(rig.sensors, name) for name in controller.sensors]
-    actuators = [named(rig.actuators, name) for name in controller.actuators]
+    actuators = driven(rig, controller.actuators)
     into = participation_of(Rig(modes, tuple(actuators), ()))
     rng = None if test.seed is None else np.random.default_rng(test.seed)
     noise = np.zeros((len(sensors), test.n_samples))
@@ -139,6 +140,7 @@ def run_loop(
         structure_arrays(rig),
         laws,
         np.array([_drive(a) for a in actuators]).reshape(-1, 9),
+        mixing(actuators) if any(a.crosstalk for a in actuators) else np.zeros((0, 0)),
         np.ascontiguousarray(into),
         np.array([_sense(s, test.n_samples) for s in sensors]).reshape(-1, 7),
         _output_matrices(rig, sensors),
@@ -196,6 +198,26 @@ def check_fits(rig: Rig, controller: DigitalController, test: LoopTest) -> None:
 def named(parts: Sequence[P], name: str) -> P:
     """The first of the actuators or sensors with a name."""
     return next(part for part in parts if part.name == name)
+
+
+def driven(rig: Rig, names: Sequence[str]) -> list[Actuator]:
+    """The actuators of a rig that a controller drives; cross-talk from others, which have no command, is left out.
+
+    Raises:
+        ValueError: another actuator takes a share of the command of one of them.
+    """
+    for actuator in rig.actuators:
+        taken = [name for name, _ in actuator.crosstalk if name in names]
+        if taken and actuator.name not in names:
+            raise ValueError(
+                f"actuator {actuator.name} takes a share of the command of {taken[0]}, and the controller does not"
+                f" drive it: let the controller drive {actuator.name} too"
+            )
+    actuators = [named(rig.actuators, name) for name in names]
+    return [
+        replace(a, crosstalk=tuple(each for each in a.crosstalk if each[0] in names)) if a.crosstalk else a
+        for a in actuators
+    ]
 
 
 def _drive(a: Actuator) -> list[float]:

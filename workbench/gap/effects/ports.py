@@ -21,11 +21,14 @@ from workbench.gap.effects.effect import (
 )
 from workbench.records.record import QUANTITIES
 from workbench.rig.rig import Rig
+from workbench.rig.simulate import predict
 from workbench.structure.domain import Interval, NamedPoints, Where, centred_at, reach
 
 SENSOR_UNIT = "unit of the sensor"
-# of a residual's mean square: cross-talk is tried where another sensor's reading explains more of it
+# of a residual's mean square: cross-talk is tried where another channel explains more of it
 LEAST_CROSSTALK = 0.05
+# of a command's mean square: cross-talk from another that differs by less from a multiple of it is a gain
+LEAST_OWN = 0.01
 Starts = Callable[[Evidence, Any], Iterable[dict[str, Any]]]
 
 SLOW_ENTRY = 0.1  # of the rms step between samples: a reading that reaches its top in a larger step is cut off there
@@ -39,6 +42,10 @@ TURNING_SAMPLES = 2  # longest stay of a motion that reverses slowly
 def each_actuator(rig: Rig) -> tuple[str, ...]:
     """Names of the inputs that go through an actuator; a hammer does not."""
     return tuple(a.name for a in rig.actuators if not a.direct)
+
+
+def each_input(rig: Rig) -> tuple[str, ...]:
+    return tuple(a.name for a in rig.actuators)
 
 
 def each_sensor(rig: Rig) -> tuple[str, ...]:
@@ -68,10 +75,13 @@ def _with_gain(rig: Rig, side: str, target: str, gain: float) -> Rig:
 
 
 def _swapped(rig: Rig, side: str, pair: tuple[str, str]) -> Rig:
-    """The rig with two actuators or sensors exchanged; each channel keeps its name, its noise and its quantisation."""
+    """The rig with two actuators or sensors exchanged; each channel keeps its name, its noise and its quantisation.
+
+    It also keeps the commands of other channels that it takes a share of.
+    """
     by_name = {port.name: port for port in getattr(rig, side)}
     exchanged = {pair[0]: by_name[pair[1]], pair[1]: by_name[pair[0]]}
-    kept = ("name", "noise_std", "step") if side == "sensors" else ("name",)
+    kept = ("name", "noise_std", "step") if side == "sensors" else ("name", "crosstalk")
     ports: Any = tuple(
         replace(exchanged.get(name, port), **{field: getattr(port, field) for field in kept})
         for name, port in by_name.items()
@@ -335,8 +345,77 @@ SWAPPED_INPUTS = Kind(
     parameters=lambda rig, _: (),
     apply=lambda rig, pair, _: _swapped(rig, "actuators", pair),
     starts=lambda evidence, _: [{}],
-    targets=lambda rig: tuple(combinations((a.name for a in rig.actuators), 2)),
+    targets=lambda rig: tuple(combinations(each_input(rig), 2)),
     phrase="an exchange of two inputs",
+)
+
+
+def _responses_to_share(evidence: Evidence, pair: tuple[str, str]) -> list[np.ndarray]:
+    """Readings (n_sensors, n_samples) of each record per share of the second input's command in the first.
+
+    Laws at points and limits of the channels are left out.
+    """
+    found = []
+    for record, residual in zip(evidence.data.records, evidence.residuals, strict=True):
+        rig = evidence.rig.in_record(record.name)
+        linear = replace(
+            rig,
+            actuators=tuple(
+                replace(a, dead_zone=0.0, limit=np.inf, rate_limit=np.inf, hysteresis_share=0.0, bias=0.0)
+                for a in rig.actuators
+            ),
+            sensors=tuple(replace(s, bias=0.0, drift=0.0, limit=np.inf, step=0.0) for s in rig.sensors),
+            elements=(),
+            stiffness_rate=0.0,
+        )
+        to, source = (each_input(rig).index(name) for name in pair)
+        inputs = np.zeros_like(record.inputs)
+        inputs[to] = record.inputs[source]
+        found.append(predict(linear, replace(record, inputs=inputs))[:, -residual.shape[1] :])
+    return found
+
+
+def _actuator_crosstalk_starts(evidence: Evidence, pair: tuple[str, str]) -> list[dict[str, float]]:
+    """Share of the second input's command, acting where the first does, if that explains enough of the residuals.
+
+    None where the commands are proportional: cross-talk is then a gain.
+    """
+    rows = [each_input(evidence.rig).index(name) for name in pair]
+    own, source = np.concatenate([record.inputs[rows] for record in evidence.data.records], axis=1)
+    size = float(own @ own)
+    alike = float(own @ source) ** 2 > (1.0 - LEAST_OWN) * size * float(source @ source)
+    if not source.any() or (size > 0 and alike):
+        return []
+    noise = np.array(list(_noise(evidence.rig).values()))[:, None]
+    change = np.concatenate([(y / noise).ravel() for y in _responses_to_share(evidence, pair)])
+    residual = np.concatenate([(y / noise).ravel() for y in evidence.residuals])
+    power = float(change @ change)
+    share = float(residual @ change) / power if power > 0 else 0.0
+    return [{"share": share}] if share**2 * power > LEAST_CROSSTALK * float(residual @ residual) else []
+
+
+def _with_share(rig: Rig, pair: tuple[str, str], share: float) -> Rig:
+    """The rig with a share of the second input's command added to that of the first."""
+    name, source = pair
+    return replace(
+        rig,
+        actuators=tuple(
+            replace(a, crosstalk=(*a.crosstalk, (source, share))) if a.name == name else a for a in rig.actuators
+        ),
+    )
+
+
+ACTUATOR_CROSSTALK = Kind(
+    name="actuator_crosstalk",
+    path="actuator",
+    parameters=lambda rig, _: (Parameter("share", "", -1e3, 1e3, scale=0.1, neutral=0.0),),
+    apply=lambda rig, pair, v: _with_share(rig, pair, v["share"]),
+    starts=_actuator_crosstalk_starts,
+    targets=lambda rig: tuple(permutations(each_actuator(rig), 2)),
+    signed=True,
+    second_channel="from",
+    conjunction=" from ",
+    phrase="cross-talk between actuators",
 )
 
 
@@ -632,6 +711,7 @@ KINDS = (
     ACTUATOR_BIAS,
     ACTUATOR_RATE_LIMIT,
     SWAPPED_INPUTS,
+    ACTUATOR_CROSSTALK,
     SENSOR_GAIN,
     SENSOR_BIAS,
     SENSOR_DRIFT,

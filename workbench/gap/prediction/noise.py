@@ -12,6 +12,7 @@ from workbench.arrays import Floats
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import ForceFilter, force_filter, log_likelihood, sampled_model
 from workbench.records.record import Record
+from workbench.rig.actuators import mixing
 from workbench.rig.rig import Rig, shape_of
 from workbench.rig.simulate import predict
 
@@ -264,6 +265,8 @@ def input_filters(rig: Rig, data: FitData, share: float) -> dict[str, ForceFilte
     sample_times = {record.sample_time for record in data.records}
     models = {dt: sampled_model(rig.modes, rig.sensors, data.noise, dt) for dt in sample_times}
     patterns = np.column_stack([a.gain * shape_of(rig.modes, a) for a in rig.actuators])
+    if any(a.crosstalk for a in rig.actuators):
+        patterns = patterns @ mixing(rig.actuators)
     filters = {}
     for record in data.records:
         power = share**2 * (record.inputs**2).mean(axis=1)
