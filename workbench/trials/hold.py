@@ -14,7 +14,7 @@ from workbench.cases.case import Case, read_case
 from workbench.cases.writing import write_case
 from workbench.gap.diagnose_case import diagnose_case
 from workbench.trials.imperfections import CLEAN, IMPERFECTIONS, MIMICS, SIZES, TRIPLE
-from workbench.trials.make import KINDS, OUTSIDE_KINDS, find_trial_with_plant
+from workbench.trials.make import KINDS, OUTSIDE_KINDS, check_kinds, find_trial_with_plant
 from workbench.trials.rigs import FRAMES, MEMBERS, PLATES
 from workbench.trials.scoring import Tally, score, score_imperfect, tally
 
@@ -125,7 +125,7 @@ def write_trials(
         report: called with (name, share done).
 
     Raises:
-        ValueError: the labels would be in the folder that the diagnosis reads.
+        ValueError: an unknown kind, or labels that would be in the folder that the diagnosis reads.
     """
     folder, labels = Path(folder), Path(labels)
     if labels.resolve().is_relative_to(folder.resolve()):
@@ -135,6 +135,7 @@ def write_trials(
     else:
         draws = draw_imperfect_kinds(n, seed, imperfections=imperfections, size=size)
     if kinds is not None:
+        check_kinds(kind for hidden in kinds for kind in hidden)  # one that is impossible on a bench is replaced
         draws = [draw._replace(kinds=tuple(hidden)) for draw, hidden in zip(draws, kinds, strict=True)]
     labelled = {}
     for i, draw in enumerate(draws):

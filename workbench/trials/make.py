@@ -1,6 +1,6 @@
 """A blind trial: a case with hidden effects and its label, simulated independently of the diagnosis."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -72,9 +72,7 @@ def make_trial_with_plant(
     """
     if imperfections not in IMPERFECTIONS:
         raise ValueError(f"imperfections must be one of {', '.join(IMPERFECTIONS)}; got {imperfections!r}")
-    unknown = [kind for kind in kinds if kind not in (*KINDS, *OUTSIDE_KINDS)]
-    if unknown:
-        raise ValueError(f"kind {unknown[0]!r} is neither in the vocabulary nor among {', '.join(OUTSIDE_KINDS)}")
+    check_kinds(kinds)
     rng = np.random.default_rng(seed)
     reason = ""
     for _ in range(MOST_BENCHES if like is None else MOST_DRAWS):
@@ -89,6 +87,13 @@ def make_trial_with_plant(
         except Unsuitable as error:
             reason = str(error)
     raise ValueError(f"no case with {' and '.join(kinds)} could be generated on this bench; the last draw: {reason}")
+
+
+def check_kinds(kinds: Iterable[str]) -> None:
+    """Refuse a kind that no trial can hide."""
+    unknown = [kind for kind in kinds if kind not in (*KINDS, *OUTSIDE_KINDS)]
+    if unknown:
+        raise ValueError(f"kind {unknown[0]!r} is neither in the vocabulary nor among {', '.join(OUTSIDE_KINDS)}")
 
 
 def _draw_effects(
