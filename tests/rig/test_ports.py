@@ -274,3 +274,19 @@ def test_cross_talk_is_refused_where_there_is_no_command():
         replace(tap, crosstalk=(("F1", 0.1),))
     with pytest.raises(ValueError, match="F1: the share of the command of F2 must be finite; got nan"):
         Actuator("F1", 2.0, crosstalk=(("F2", np.nan),))
+
+
+@pytest.mark.parametrize("delays", [(0.13, 0.0, 0.0), (0.0, 0.04, 0.2), (0.27, 0.13, 0.05)])
+@pytest.mark.parametrize("elements", [(), (CubicSpring(4.0, 0.3),)], ids=["linear", "stepped"])
+def test_a_late_sensor_takes_its_share_of_another_as_late(elements, delays):
+    """Cross-talk precedes the delay: the share is of what the other measured that long ago, not of its late reading."""
+    shares = (("v", 0.4), ("a", 0.2))
+    sensors = tuple(replace(s, delay=delay) for s, delay in zip(SENSORS, delays, strict=True))
+    crossed = (replace(sensors[0], crosstalk=shares), *sensors[1:])
+    found, *peers = (
+        simulate(rig(sensors=each, elements=elements), drive(120), sample_time=DT).outputs
+        for each in (crossed, sensors, tuple(replace(s, delay=delays[0]) for s in SENSORS))
+    )
+    peer = peers[0].copy()
+    peer[0] += 0.4 * peers[1][1] + 0.2 * peers[1][2]
+    np.testing.assert_allclose(found, peer, atol=1e-12 * np.abs(peer).max())

@@ -1,5 +1,7 @@
 """Readings of sensors from the motion of a rig, with all imperfections but noise."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -30,28 +32,37 @@ def _shapes(rig: Rig) -> Floats:
 
 def read(rig: Rig, motion: Motion) -> Floats:
     """Noise-free readings (n_sensors, n_samples) of a motion, clipped, and with the mean effect of rounding."""
-    shapes = _shapes(rig)
-    delays = np.array([0.0 if sensor.interpolated else sensor.delay for sensor in rig.sensors])
-    outputs = np.empty((len(rig.sensors), motion.displacement.shape[1]))
-    for quantity in {sensor.quantity for sensor in rig.sensors}:
-        order, here = MEASURED[quantity][1], [j for j, s in enumerate(rig.sensors) if s.quantity == quantity]
+    shapes, names = _shapes(rig), [sensor.name for sensor in rig.sensors]
+    truths = _delayed(rig, motion, rig.sensors, shapes)
+    outputs = truths.copy() if any(sensor.crosstalk for sensor in rig.sensors) else truths
+    for j, sensor in enumerate(rig.sensors):
+        for name, share in sensor.crosstalk:
+            if name not in names:
+                raise ValueError(f"sensor {sensor.name} reads a share of {name!r}, which is no sensor of the rig")
+            i = names.index(name)
+            source = rig.sensors[i]
+            as_late = replace(source, delay=sensor.delay, interpolated=sensor.interpolated)
+            taken = truths[i] if as_late == source else _delayed(rig, motion, (as_late,), shapes[[i]])[0]
+            outputs[j] += share * taken
+        outputs[j] = sensor_reading(sensor, outputs[j], motion.sample_time)
+    return outputs
+
+
+def _delayed(rig: Rig, motion: Motion, sensors: Sequence[Sensor], shapes: Floats) -> Floats:
+    """Measured quantities (n_sensors, n_samples) of a motion after each sensor's delay, for shapes (n_sensors, n)."""
+    delays = np.array([0.0 if sensor.interpolated else sensor.delay for sensor in sensors])
+    outputs = np.empty((len(sensors), motion.displacement.shape[1]))
+    for quantity in {sensor.quantity for sensor in sensors}:
+        order, here = MEASURED[quantity][1], [j for j, s in enumerate(sensors) if s.quantity == quantity]
         prompt, late = [j for j in here if delays[j] == 0], [j for j in here if delays[j] != 0]
         if prompt:
             outputs[prompt] = shapes[prompt] @ getattr(motion, DERIVATIVES[order])
         if late:
             outputs[late] = _read_late(rig, motion, order, shapes[late], delays[late])
-    for j, sensor in enumerate(rig.sensors):
+    for j, sensor in enumerate(sensors):
         if sensor.delay and sensor.interpolated:
             samples = np.arange(outputs.shape[1])
             outputs[j] = np.interp(samples - sensor.delay / motion.sample_time, samples, outputs[j])
-    names = [sensor.name for sensor in rig.sensors]
-    truths = outputs.copy() if any(sensor.crosstalk for sensor in rig.sensors) else outputs
-    for j, sensor in enumerate(rig.sensors):
-        for name, share in sensor.crosstalk:
-            if name not in names:
-                raise ValueError(f"sensor {sensor.name} reads a share of {name!r}, which is no sensor of the rig")
-            outputs[j] += share * truths[names.index(name)]
-        outputs[j] = sensor_reading(sensor, outputs[j], motion.sample_time)
     return outputs
 
 

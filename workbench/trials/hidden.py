@@ -143,7 +143,7 @@ HIDE: dict[str, Hide] = {
     "sensor_lag": _sensor(time_constant="time_constant"),
     "sensor_misplacement": partial(_moved, "sensors", "output"),
     "sensor_delay": _sensor(delay="delay"),
-    "sensor_crosstalk": _reading(lambda y, sample_time, e: e["share"] * y[e["from"]]),
+    "sensor_crosstalk": lambda p, e: replace(p, crosstalk=(*p.crosstalk, (e["output"], e["from"], e["share"]))),
     "swapped_outputs": partial(_swapped, "sensors", "output"),
     "sensor_clipping": _sensor(limit="limit"),
     "sensor_quantisation": _sensor(step="step"),

@@ -48,6 +48,7 @@ class Plant:
         noises: (at, rms, corner in Hz) of unmeasured random forces.
         mix: (n_inputs, n_inputs) share of every command in that of each actuator; None for the identity.
         curvature: (n_inputs,) of u + curvature u |u|; None for none.
+        crosstalk: (output, other output, share of what the other measures), before the output's delay.
         reading_laws: readings (n_outputs, n_samples), sample time -> readings, before gain and bias.
         noise_memory: lag-one correlation of a sensor's noise; 0 for white noise.
         logging_noise: standard deviation of the noise of each logged input, over the input's rms in a record.
@@ -69,6 +70,7 @@ class Plant:
     noises: tuple[tuple[Where, float, float], ...] = ()
     mix: np.ndarray | None = None
     curvature: np.ndarray | None = None
+    crosstalk: tuple[tuple[str, str, float], ...] = ()
     reading_laws: tuple[Callable[[np.ndarray, float], np.ndarray], ...] = ()
     noise_memory: float = 0.0
     logging_noise: float = 0.0
@@ -219,25 +221,33 @@ class SolvedPlant:
         return motion.Pieces(float(sample_time), edges, steps)
 
     def truth(self, moved: ModalMotion, sample_time: float) -> np.ndarray:
-        """The readings (n_outputs, n_samples) of perfect sensors, each with its delay."""
-        rows = []
-        for sensor, shape in zip(self.plant.sensors, self.at_sensors, strict=True):
-            order = MEASURED[sensor.quantity][1]
-            if sensor.delay == 0:
-                rows.append(moved[order] @ shape)
-                continue
-            if sensor.interpolated:
-                whole, share = divmod(sensor.delay / sample_time, 1.0)
-                each = moved[order] @ shape
-                older = np.r_[np.full(int(whole) + 1, each[0]), each]
-                rows.append((1.0 - share) * older[1 : each.size + 1] + share * older[: each.size])
-                continue
-            back = np.round(-sensor.delay / sample_time, 12)
-            piece = int(np.argmin(np.abs(moved.starts - back % 1.0)))
-            shift = -int(np.floor(back))
-            read = moved.pieces[order, piece] @ shape
-            rows.append(np.r_[np.zeros(shift), read][: read.size])
-        return np.array(rows)
+        """The readings (n_outputs, n_samples) of perfect sensors, each with its delay and then shares of others."""
+        sensors, y = (
+            self.plant.sensors,
+            [self._true(j, s, moved, sample_time) for j, s in enumerate(self.plant.sensors)],
+        )
+        names = [sensor.name for sensor in sensors]
+        for output, source, share in self.plant.crosstalk:
+            j, i = names.index(output), names.index(source)
+            as_late = replace(sensors[i], delay=sensors[j].delay, interpolated=sensors[j].interpolated)
+            y[j] = y[j] + share * self._true(i, as_late, moved, sample_time)
+        return np.array(y)
+
+    def _true(self, j: int, sensor: Sensor, moved: ModalMotion, sample_time: float) -> np.ndarray:
+        """The reading (n_samples,) of a perfect sensor, at the place of the j-th, with its delay."""
+        order, shape = MEASURED[sensor.quantity][1], self.at_sensors[j]
+        if sensor.delay == 0:
+            return np.asarray(moved[order] @ shape)
+        if sensor.interpolated:
+            whole, share = divmod(sensor.delay / sample_time, 1.0)
+            each = moved[order] @ shape
+            older = np.r_[np.full(int(whole) + 1, each[0]), each]
+            return np.asarray((1.0 - share) * older[1 : each.size + 1] + share * older[: each.size])
+        back = np.round(-sensor.delay / sample_time, 12)
+        piece = int(np.argmin(np.abs(moved.starts - back % 1.0)))
+        shift = -int(np.floor(back))
+        read = moved.pieces[order, piece] @ shape
+        return np.asarray(np.r_[np.zeros(shift), read][: read.size])
 
     def readings(self, moved: ModalMotion, sample_time: float, rng: np.random.Generator | None = None) -> np.ndarray:
         """The readings (n_outputs, n_samples) of the sensors; without `rng` their mean over the noise."""
