@@ -428,7 +428,7 @@ def test_a_spring_beside_a_hinge_resists_turning_if_it_resists_at_all(stiffness)
 
 def test_sets_are_named_in_words():
     assert (
-        in_words("coulomb_friction + actuator_bias[F2]") == "a friction force and a constant force of an actuator (F2)"
+        in_words("coulomb_friction + actuator_bias[F2]") == "Coulomb friction and a constant force of an actuator (F2)"
     )
     assert in_words("swapped_outputs[d1, d2]").endswith(" (d1, d2)") and in_words("own_law") == "own law"
     mine = replace(kind_named("cubic_spring"), name="own_law", phrase="a quadratic spring")
@@ -439,7 +439,10 @@ def test_channels_keep_their_names_in_words():
     """As a file heads its columns."""
     assert in_words("actuator_gain[drive_1 [N]]") == "a wrong actuator gain (drive_1 [N])"
     assert label_in_words("actuator_gain[drive_1 [N]]") == "actuator gain (drive_1 [N])"
-    assert label_in_words("bouc_wen") == "Bouc-Wen" and label_in_words("point_mass[x = 1]") == "point mass (x = 1)"
+    assert (
+        label_in_words("bouc_wen") == "hysteretic spring (Bouc-Wen)"
+        and label_in_words("point_mass[x = 1]") == "point mass (x = 1)"
+    )
 
 
 @pytest.mark.parametrize("offset", [-2.0, 0.0])

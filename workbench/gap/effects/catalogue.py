@@ -45,7 +45,7 @@ def kind_named(name: str, catalogue: tuple[Kind, ...] = CATALOGUE) -> Kind:
 
 
 def in_words(labels: str, catalogue: Iterable[Kind] = CATALOGUE) -> str:
-    """A set of labels in words, such as "a friction force and a constant force of an actuator (F2)".
+    """A set of labels in words, such as "Coulomb friction and a constant force of an actuator (F2)".
 
     Kinds beyond the catalogue have their own names.
     """

@@ -387,15 +387,16 @@ def names_in(target: Any) -> tuple[str, ...]:
 
 # Names in words that differ from the identifier with spaces for underscores.
 SPELLINGS = (
-    ("bouc wen", "Bouc-Wen"),
+    ("bouc wen", "hysteretic spring (Bouc-Wen)"),
     ("coulomb", "Coulomb"),
     ("two way friction", "direction-dependent friction"),
     ("one sided", "one-sided"),
+    ("crosstalk", "cross-talk"),
 )
 
 
 def label_in_words(label: str) -> str:
-    """A label as shown in figures and notes: actuator gain (F2), Bouc-Wen."""
+    """A label as shown in figures and notes: actuator gain (F2), one-sided stop."""
     name, _, target = label.partition("[")
     words = name.replace("_", " ")
     for plain, spelt in SPELLINGS:

@@ -262,7 +262,7 @@ COULOMB_FRICTION = Kind(
     force_laws={"velocity": lambda v, u: -v["force"] * np.tanh(u / v["smoothing_speed"])},
     numbers=_stated_numbers,
     without_negligible=_with_negligible_speed,
-    phrase="a friction force",
+    phrase="Coulomb friction",
 )
 
 
@@ -393,7 +393,7 @@ TWO_WAY_FRICTION = Kind(
     force_laws={"velocity": _two_way_law},
     numbers=_stated_numbers,
     without_negligible=_with_negligible_speed,
-    phrase="a friction force that differs between the two directions",
+    phrase="Coulomb friction that differs between the two directions",
 )
 
 

@@ -455,7 +455,7 @@ def _named_with_target(effect: Effect) -> str:
 
 
 def _described(effect: Effect, nominal: Rig, named_units: Units = SI) -> str:
-    """An effect in words: a friction force (force 0.021 ± 0.002 N) at x = 3.40 ± 0.01."""
+    """An effect in words: Coulomb friction (force 0.021 ± 0.002 N) at x = 3.40 ± 0.01."""
     stated = effect.stated(nominal)
     units = {p.name: named_units.named(p.unit) for p in effect.parameters(nominal) if p.name in stated}
     numbers = [
