@@ -222,10 +222,8 @@ class SolvedPlant:
 
     def truth(self, moved: ModalMotion, sample_time: float) -> np.ndarray:
         """The readings (n_outputs, n_samples) of perfect sensors, each with its delay and then shares of others."""
-        sensors, y = (
-            self.plant.sensors,
-            [self._true(j, s, moved, sample_time) for j, s in enumerate(self.plant.sensors)],
-        )
+        sensors = self.plant.sensors
+        y = [self._true(j, sensor, moved, sample_time) for j, sensor in enumerate(sensors)]
         names = [sensor.name for sensor in sensors]
         for output, source, share in self.plant.crosstalk:
             j, i = names.index(output), names.index(source)
