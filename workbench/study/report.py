@@ -25,6 +25,7 @@ from workbench.structure.modes import SampledModes, mac
 from workbench.structure.printed import command_headings, counted, joined_in_words, places_text
 from workbench.study.catalogue import find_study, output_root
 from workbench.study.pages.identification_report import IdentificationReport
+from workbench.study.pages.inputs_at_once import responses_to_inputs
 from workbench.study.pages.page import (
     FORMAT,
     PageContent,
@@ -377,7 +378,7 @@ def identification_page(
 ) -> PageContent:
     """The page of an identification report and its data; transfer functions are shown over the fitted band."""
     content = identified({**report.content, "heading": report.heading, "lines": list(report.lines)})
-    blocks = [*content.pop("blocks"), *_stabilisation(report), *_response(measured[0], report.fitted)]
+    blocks = [*content.pop("blocks"), *_stabilisation(report), *_response(measured, report.fitted)]
     return PageContent(title="Identified modes", blocks=blocks, made_by=made_by, **content)
 
 
@@ -395,7 +396,8 @@ def _stabilisation(report: IdentificationReport) -> list[dict[str, Any]]:
     return [block(figure, STABLE)]
 
 
-def _response(measured: Record | TransferFunctions, fitted: TransferFunctions | None) -> list[dict[str, Any]]:
+def _response(every: Sequence[Record | TransferFunctions], fitted: TransferFunctions | None) -> list[dict[str, Any]]:
+    measured, why_not = every[0], ""
     if isinstance(measured, TransferFunctions):
         if fitted is not None:
             kept = np.isin(measured.frequencies_hz, fitted.frequencies_hz)
@@ -411,4 +413,9 @@ def _response(measured: Record | TransferFunctions, fitted: TransferFunctions | 
             block(beside, f"{measured_by}, and of the identified modes (dashed).{rest}"),
             block(plot_coherence(measured.select_outputs(names)), "Coherence of each sensor with the input."),
         ]
-    return [block(plot_spectra(measured), f"Power spectral density of {measured.name}, by Welch's method.")]
+    if measured.n_inputs > 1 and fitted is not None:
+        shown, why_not = responses_to_inputs([one for one in every if isinstance(one, Record)], fitted)
+        if shown:
+            return shown
+    caption = f"Power spectral density of {measured.name}, by Welch's method. {why_not}".rstrip()
+    return [block(plot_spectra(measured), caption)]
