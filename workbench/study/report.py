@@ -11,7 +11,7 @@ import numpy as np
 from workbench.cases.case import read_case
 from workbench.design.loop.closed_loop import DRIFTS, stability
 from workbench.draw.design import plot_poles, plot_work_linear
-from workbench.draw.gap import plot_gaps, plot_responses
+from workbench.draw.gap import plot_gaps, plot_responses, units_of_inputs
 from workbench.draw.identification import plot_deviations, plot_mac, stabilisation_diagram
 from workbench.draw.motion import mode_motion
 from workbench.draw.placement import plot_places
@@ -82,13 +82,14 @@ def case_page_content(folder: Path) -> PageContent:
         (r.name, "fit" if r in case.fit else "validate", r.n_samples, r.sample_rate_hz, float(r.inputs.std()))
         for r in records
     ]
+    level = f"input rms [{units_of_inputs(rig.actuators, case.units)}]"
     modes = list(zip(range(1, rig.modes.n_modes + 1), rig.modes.frequencies_hz.tolist(), rig.modes.zeta.tolist()))
     return PageContent(
         title=f"Case {case.name}, before any diagnosis",
         lines=(f"{len(rig.actuators)} inputs, {len(rig.sensors)} sensors, {len(records)} records.",),
         blocks=[*moving_modes(rig, {"nominal": rig.modes}), block(beside, caption)],
         tables=[
-            ("Records", ("record", "use", "samples", "sample rate [Hz]", "input rms"), rows),
+            ("Records", ("record", "use", "samples", "sample rate [Hz]", level), rows),
             ("Nominal modes", ("mode", "frequency [Hz]", "damping ratio"), modes),
         ],
         inputs=case_inputs(folder),
