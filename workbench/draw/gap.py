@@ -130,7 +130,7 @@ def plot_where(verdict: Verdict) -> Figure:
 
 
 def units_of_inputs(actuators: Sequence[Actuator], units: Units) -> str:
-    """The units of all commands: N, or N and N m; "unit of the command" for an actuator with a gain, whose is unknown."""
+    """The units of all commands, such as N and N m; "unit of the command" where an actuator has a gain."""
     named = [units.named(force_unit(a)) if a.gain == 1 else "unit of the command" for a in actuators]
     return joined_in_words([*dict.fromkeys(named)])
 

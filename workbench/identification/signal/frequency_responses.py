@@ -80,7 +80,7 @@ def frequency_responses(records: Sequence[Record]) -> FrequencyResponses:
     scales = np.sqrt(np.where(powers > 0.0, powers, 1.0))
     alike = of_inputs / (scales[:, :, None] * scales[:, None])
     inverse = np.linalg.inv(np.where(heard[:, None, None], alike, 0.0) + 1e-12 * np.eye(n))
-    with_others = 1.0 - 1.0 / inverse.diagonal(axis1=1, axis2=2).real
+    with_others: Floats = np.asarray(1.0 - 1.0 / inverse.diagonal(axis1=1, axis2=2).real, np.float64)
     apart = heard & (with_others < SPECTRA.alike).all(axis=1)
     _check_apart(names, alike, with_others, heard, powers)
     scaled = (across / scales[:, None]) @ inverse
