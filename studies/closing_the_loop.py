@@ -1,11 +1,12 @@
 """Does a controller redesigned for the diagnosed structure hold on the hidden one, and how near is it to the best?"""
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from workbench.draw.style import COLOURS, GREY, new_figure
+from workbench.draw.style import COLOURS, grouped_bars, new_figure
 from workbench.gap.diagnose_case import diagnose_case
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect, apply_all
@@ -38,6 +39,9 @@ UNKNOWN = 0.2  # of the readings: what is left unexplained from which a fit is n
 MORE = 1.05  # times the noise: what is left, from which errors of the nominal model are fitted
 WORSE = 0.02
 NO_MORE = 0.01  # of the nominal design's work: where the redesign is asked to do no more
+
+CLASSES = (1.0, 10.0, 100.0)  # %, of the cost above that of the design on the true effects, in the figure
+CONTROLLERS = (("nominal", "nominal design", COLOURS[1]), ("redesigned", "redesign", COLOURS[0]))
 
 
 def plant(index, seed, searched=False):
@@ -221,7 +225,9 @@ def report(outcome, rows):
     outcome.check("share of readings inside the 95 % bands", inside.mean(), 0.90, at_least=True)
     outcome.check("share of readings inside the 95 % bands, at most", inside.mean(), 0.99)
     outcome.figure(
-        "cost", _figure(rows), "Cost of each hidden plant under both controllers, over that of the design on the truth."
+        "cost",
+        _figure(rows),
+        "Hidden plants by how much each controller costs on them above the design on the true effects.",
     )
 
 
@@ -245,23 +251,29 @@ def _told(outcome, result) -> bool:
 
 
 def _figure(rows):
+    """Number of plants by the cost of each controller above that of the design on the true effects."""
     figure, ax = new_figure(width=9, height=4.2)
-    best = np.array([row["true"]["cost"] for row in rows])
-    order = np.argsort([min(row["nominal"]["cost"], 1e300) / b for row, b in zip(rows, best, strict=True)])
-    for name, words, colour in (("nominal", "nominal design", COLOURS[1]), ("redesigned", "redesign", COLOURS[0])):
-        at = {stable: [i for i, j in enumerate(order) if rows[j][name]["stable"] is stable] for stable in (True, False)}
-        values = [rows[order[i]][name]["cost"] / best[order[i]] for i in at[True]]
-        ax.plot(at[True], values, "o", color=colour, markersize=4, label=words)
-        if at[False]:  # above all that can be drawn
-            top = ax.get_xaxis_transform()
-            ax.plot(
-                at[False], np.full(len(at[False]), 0.97), "x", color=colour, label=f"{words}: unstable", transform=top
-            )
-    ax.axhline(1.0, color=GREY, linewidth=0.8)
+    edges = np.array([*CLASSES, np.inf])
+    names = [f"at most {CLASSES[0]:g} %", *(f"{low:g} to {high:g} %" for low, high in pairwise(CLASSES))]
+    names += [f"over {CLASSES[-1]:g} %", "unstable"]
+    shifts, width = grouped_bars(2)
+    for (name, words, colour), shift in zip(CONTROLLERS, shifts, strict=True):
+        stable = [row for row in rows if row[name]["stable"]]
+        above = np.array([100.0 * (row[name]["cost"] / row["true"]["cost"] - 1.0) for row in stable])
+        counts = [*np.bincount(np.searchsorted(edges, above), minlength=edges.size), len(rows) - len(stable)]
+        ax.bar(np.arange(len(names)) + shift, counts, width, color=colour, label=words)
+        for i, count in enumerate(counts):
+            ax.annotate(str(count), (i + shift, count), (0, 3), textcoords="offset points", ha="center", color=colour)
+        if name == "nominal" and above.max() > CLASSES[-1]:
+            worst = f"≤ {1.0 + above.max() / 100.0:.3g} times"
+            ax.annotate(worst, (len(names) - 2, counts[-2]), (0, 18), textcoords="offset points", ha="center")
+    ax.set_xticks(range(len(names)), names)
     ax.set(
-        yscale="log",
-        xlabel="simulated plants, sorted by the cost of the nominal controller",
-        ylabel="cost / that of the design\non the true effects [-]",
+        xlabel="cost above that of the design on the true effects [%]",
+        ylabel=f"plants, of {len(rows)} [-]",
+        title="what each controller costs on the simulated plants",
     )
-    ax.legend(fontsize=8)
+    ax.margins(y=0.12)
+    ax.legend(loc="upper right")
+    ax.grid(False, axis="x")
     return figure

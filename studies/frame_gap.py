@@ -29,6 +29,7 @@ STIFFNESS, YIELD = 900.0, 1.2e-4  # N/m, m: of the brace along x, until its bolt
 SHAKERS, SENSORS = ("L3.x", "r1.x"), ("L1.x", "L2.x", "L3.x", "l1.x", "r2.x", "l3.x")
 DT, SAMPLES, SUBSTEPS, BAND_HZ = 2e-3, 2000, 10, (1.0, 130.0)
 LEVELS = {"low": (0.1, "fit"), "high": (0.8, "fit"), "check": (0.5, "validate")}  # N rms
+SHOWN = 40  # samples before and after the largest stretch, in the figure
 NOISE = 2e-3  # of the signal, in the high record
 
 
@@ -123,7 +124,7 @@ def study(outcome, data=None):
         plot_joint(at, lines, effect, loop),
         "Left, the frame with its two shakers and six accelerometers, the real brace, and between which floors the"
         " diagnosis found it: along x all points of a floor move as one. Right, the force of the real joint over its"
-        " stretch in the high record, and the law that was found.",
+        " stretch, where the high record has the largest, and the law that was found.",
     )
     outcome.figure(
         "responses",
@@ -133,38 +134,57 @@ def study(outcome, data=None):
 
 
 def plot_joint(at, lines, effect, loop):
-    places = at | {"L0": (0.0, 0.0), "R0": (WIDTH, 0.0)}
-    figure, (left, right) = new_figure(1, 2, width=9, height=5, gridspec_kw={"width_ratios": (2, 3)})
-    for one, other in lines:
-        left.plot(*np.array([places[one], places[other]]).T, color=GREY, linewidth=3)
-    for names, colour, marker, label in (
-        (SENSORS, COLOURS[0], "o", "accelerometer"),
-        (SHAKERS, COLOURS[1], ">", "shaker"),
-    ):
-        spots = np.array([places[name.split(".")[0]] for name in names])
-        shift = (-0.03, 0.0) if marker == ">" else (0.0, 0.0)
-        left.plot(*(spots + shift).T, marker, color=colour, markersize=10, label=label, zorder=3)
-    brace = np.array([places[name.split(".")[0]] for name in BETWEEN])
-    left.plot(*brace.T, color=COLOURS[6], linewidth=7, alpha=0.35, label="real brace")
-    # along x a floor moves as one: what was found acts between two floors, whichever of their points it names
-    low, high = sorted(places[name.split(".")[0]][1] for name in effect.at)
-    for y in (low, high):
-        left.plot([0.0, WIDTH], [y, y], color=COLOURS[2], linewidth=7, alpha=0.6, zorder=2.5)
-    arrow = {"arrowstyle": "<->", "color": COLOURS[2], "linewidth": 2.5}
-    left.annotate("", (1.12 * WIDTH, low), (1.12 * WIDTH, high), arrowprops=arrow)
-    label = f"identified: {effect.kind.words}\nbetween these floors, in x"
-    left.plot([], [], color=COLOURS[2], linewidth=7, alpha=0.6, label=label)
-    left.set(aspect="equal", title="location of the joint", xlim=(-0.08, 1.2 * WIDTH))
-    left.axis("off")
-    left.legend(loc="upper center", bbox_to_anchor=(0.5, 0.0), fontsize=9)
+    """The frame with the joint in it, and the force of the joint over its stretch about the largest one."""
+    figure, (left, right) = new_figure(1, 2, width=9.5, height=5, gridspec_kw={"width_ratios": (4, 5)})
+    _frame_with_joint(left, at | {"L0": (0.0, 0.0), "R0": (WIDTH, 0.0)}, lines, effect)
     values = effect.values
     force, found = 0.0, [0.0]
     for step in np.diff(loop[:, 0]):  # the law is odd: its sign does not matter
         for part in np.full(20, step / 20):
             force += part - (abs(part) * force + part * abs(force)) / (2.0 * values["yield_displacement"])
         found.append(values["stiffness"] * force)
-    right.plot(1e3 * loop[:, 0], loop[:, 1], color=COLOURS[6], linewidth=4, alpha=0.35, label="real joint")
-    right.plot(1e3 * loop[:, 0], np.array(found), color=COLOURS[2], linewidth=0.8, label="identified law")
-    right.set(xlabel="stretch of the joint [mm]", ylabel="force [N]", title="force versus stretch of the joint")
-    right.legend()
+    peak = int(np.clip(np.abs(loop[:, 0]).argmax(), SHOWN, len(loop) - SHOWN))
+    shown = slice(peak - SHOWN, peak + SHOWN)  # a few loops: all of them hide one another
+    stretch, real, law = 1e3 * loop[shown, 0], loop[shown, 1], np.array(found)[shown]
+    right.plot(stretch, real, color=GREY, linewidth=6, alpha=0.4, label="real joint")
+    right.plot(stretch, law, color=COLOURS[2], linewidth=1.8, linestyle="--", label="identified law")
+    slip = values["stiffness"] * values["yield_displacement"]
+    right.axhline(slip, color=COLOURS[6], linewidth=0.8, linestyle=":")
+    label = f"identified: slips at {slip:.3g} N,\nstiffness {values['stiffness']:.4g} N/m"
+    right.text(0.02, 0.98, label, transform=right.transAxes, va="top")
+    low, high = 1.15 * min(real.min(), -slip), 1.5 * slip
+    right.set(xlabel="stretch of the joint [mm]", ylabel="force of the joint [N]", ylim=(low, high))
+    right.set_title(f"the law found is the real one: {2 * SHOWN * DT:g} s of the high record")
+    right.legend(loc="lower right")
     return figure
+
+
+def _frame_with_joint(ax, places, lines, effect):
+    for one, other in lines:
+        ax.plot(*np.array([places[one], places[other]]).T, color=GREY, linewidth=3)
+    brace = np.array([places[name.split(".")[0]] for name in BETWEEN])
+    ax.plot(*brace.T, color=COLOURS[6], linewidth=5, linestyle=":")
+    ax.text(0.96 * WIDTH, brace[0, 1] + 0.05, "real brace,\nwhich slips", ha="right", va="bottom", fontsize=9)
+    # along x a floor moves as one: what was found acts between two floors, whichever of their points it names
+    low, high = sorted(places[name.split(".")[0]][1] for name in effect.at)
+    for y in (low, high):
+        ax.plot([0.0, WIDTH], [y, y], color=COLOURS[2], linewidth=7, alpha=0.6, zorder=2.5)
+    ax.plot([1.12 * WIDTH] * 2, [low, high], "-_", color=COLOURS[2], linewidth=2.5, markersize=12)
+    found = f"identified:\n{effect.kind.words},\nbetween these\ntwo floors, in x"
+    ax.text(1.2 * WIDTH, (low + high) / 2, found, color=COLOURS[2], va="center")
+    for names, colour, marker, words in (
+        (SENSORS, COLOURS[0], "o", "accelerometer"),
+        (SHAKERS, COLOURS[1], ">", "shaker"),
+    ):
+        spots = np.array([places[name.split(".")[0]] for name in names])
+        ax.plot(*(spots - (0.03 * (marker == ">"), 0.0)).T, marker, color=colour, markersize=10, label=words, zorder=3)
+    for storey in range(1, STOREYS + 1):
+        ax.text(-0.08, STOREY * storey, f"floor {storey}", ha="right", va="center", fontsize=9)
+    ax.plot([-0.05, WIDTH + 0.05], [0.0, 0.0], color=COLOURS[6], linewidth=2)
+    ax.text(-0.08, 0.0, "ground", ha="right", va="center", fontsize=9)
+    ax.plot([0.0, WIDTH], [-0.09, -0.09], "-|", color=COLOURS[6], linewidth=1.0, markersize=8)
+    ax.text(WIDTH / 2, -0.1, f"{WIDTH:g} m", ha="center", va="top", fontsize=9)
+    ax.set(aspect="equal", xlim=(-0.28, 1.95 * WIDTH), ylim=(-0.15, STOREY * STOREYS + 0.2))
+    ax.set_title("where the joint is")
+    ax.axis("off")
+    ax.legend(loc="upper left", ncols=2)

@@ -82,6 +82,46 @@ def test_the_page_of_a_driven_record_shows_the_response_of_the_modes_beside_the_
         assert np.median(np.abs(apart)) < 3.0
 
 
+@pytest.mark.parametrize("second", ["independent", "the same signal"])
+def test_the_pages_of_a_record_of_two_inputs_show_the_responses_to_each_or_say_why_not(run, tmp_path, second):
+    """Truth: the z-transform of a mode under the forces of two shakers."""
+    rng, pole, sizes = np.random.default_rng(0), (-0.02 + 1j) * 2.0 * np.pi * 30.0, np.array([[1.0, -0.4]])
+    forces = rng.standard_normal((2, 2000))
+    if second == "the same signal":
+        forces[1] = 2.0 * forces[0]
+    step = np.exp(pole / RATE)
+    gain = (step - 1.0) / pole / (2j * pole.imag)
+    motion = 2.0 * np.real(lfilter([0.0, gain], [1.0, -step], (sizes @ forces)[0].astype(complex)))
+    outputs = np.arange(1.0, 6.0)[:, None] * motion + 0.02 * motion.std() * rng.standard_normal((5, 2000))
+    channels = tuple(Channel(f"y{j + 1}", "displacement") for j in range(5))
+    inputs = tuple(Channel(name, "force") for name in ("F1", "F2"))
+    write_record(Record(1.0 / RATE, outputs, channels, forces, inputs), tmp_path / "driven.csv")
+    commands = [("look", ()), ("identify", ("--modes", 1, "--seconds", 1))]
+    for command, options in commands[: 1 if second == "the same signal" else 2]:  # modes of such inputs are refused
+        page = tmp_path / f"{command}.html"
+        found = run(command, tmp_path / "driven.csv", *options, "--page", page)
+        assert found.exit_code == 0, found.output
+        blocks = json.loads(page.with_suffix(".page.json").read_text())["blocks"]
+        caption = blocks[-1]["caption"]
+        if second == "the same signal":
+            why = "No frequency responses are shown: the inputs F1 and F2 are correlated, with a coherence of 1.000"
+            assert caption.startswith("Power spectral density") and why in caption
+            continue
+        assert "Shown are 4 of 5 outputs, those of highest level first." in caption
+        assert ("identified modes (dashed)" in caption) is (command == "identify")
+        *panels, coherence = blocks[-1]["figure"]["panels"]
+        assert [panel["y"]["label"][:3] for panel in panels] == ["|y5", "|y4", "|y3", "|y2"]
+        for panel, size in zip(panels, (5.0, 4.0, 3.0, 2.0), strict=True):
+            for mark, to_input in zip(panel["marks"], (*sizes[0], *sizes[0]), strict=False):
+                hertz, drawn = np.array(mark["x"]), np.array(mark["y"])
+                z = np.exp(2j * np.pi * hertz / RATE)
+                exact = size * abs(to_input) * np.abs(gain / (z - step) + np.conj(gain) / (z - np.conj(step)))
+                seen = (hertz > 10.0) & (hertz < 50.0)
+                assert np.median(np.abs(drawn / exact - 1.0)[seen]) < 0.1
+            assert len(panel["marks"]) == (4 if command == "identify" else 2)
+        assert len(coherence["marks"]) == 4
+
+
 @pytest.mark.slow
 def test_the_page_of_transfer_functions_shows_the_band_that_was_fitted(run, tmp_path):
     from scipy.io import savemat

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
-from workbench.draw.gap import ALIKE, _plot_places, plot_responses
+from workbench.draw.gap import ALIKE, _plot_places, plot_responses, units_of_inputs
+from workbench.draw.interactive import described
 from workbench.draw.motion import mode_motion
 from workbench.draw.style import new_figure
 from workbench.records.units import SI
@@ -14,7 +15,7 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import simulate
-from workbench.structure.domain import Interval, Rectangle
+from workbench.structure.domain import Interval, NamedPoints, Rectangle
 
 NOMINAL, CORRECTED = "#d55e00", "#0072b2"
 
@@ -57,6 +58,29 @@ def test_over_a_plate_places_have_a_colour_bar_and_marks_a_legend():
     assert top == pytest.approx(ALIKE) and bottom == pytest.approx(np.ptp(profile))
     assert [text.get_text() for text in ax.get_legend().get_texts()] == ["likeliest", "named effect"]
     assert all(line.get_path_effects() for line in ax.lines), "each has a white edge"
+
+
+def test_named_points_that_fit_alike_have_bars_that_are_seen():
+    names = ("a.x", "b.x", "c.x", "d.x", "e.x")
+    figure, ax = new_figure()
+    _plot_places(ax, verdict_of(NamedPoints(names), names, np.array([-3.0, -40.0, -3.02, -3000.0, -3.0]), "b.x"))
+    (panel,) = described(figure)["panels"]  # a page draws it, not a picture
+    (bars,) = (mark for mark in panel["marks"] if mark["kind"] == "bars")
+    low, high = panel["x"]["limits"]
+    lengths = [np.log(box[1] / box[0]) / np.log(high / low) for box in bars["boxes"]]
+    assert min(lengths) > 0.05 and max(lengths) < 1.0
+    np.testing.assert_allclose([box[1] for box in bars["boxes"]], [ALIKE, ALIKE, ALIKE, 37.0, 2997.0])
+    assert [t["text"] for t in panel["marks"] if t["kind"] == "text"] == ["likeliest", "as likely", "as likely"]
+    assert [name for _, name in panel["y"]["ticks"]] == ["a.x", "e.x", "c.x", "b.x (named)", "d.x"]
+    assert panel["x"]["ticks"][0][1] == "≤ 0.1"
+
+
+def test_the_rms_of_inputs_has_their_units():
+    force, other, moment = Actuator("F", 0.3), Actuator("G", 0.5), Actuator("M", 0.4, quantity="moment")
+    driven = Actuator("U", 0.4, gain=2.5)
+    assert units_of_inputs([force, other], SI) == "N"
+    assert units_of_inputs([force, moment], SI) == "N and N m"
+    assert units_of_inputs([driven], SI) == "unit of the command"
 
 
 def test_a_model_has_one_colour_in_responses_and_in_shapes_that_move(hinged_beam):

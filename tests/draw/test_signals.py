@@ -5,7 +5,8 @@ import pytest
 from scipy.signal import lfilter, welch
 
 from workbench.draw.plot import plot
-from workbench.draw.signals import plot_frf, plot_transfer, power_spectrum
+from workbench.draw.signals import plot_frf, plot_frf_of_inputs, plot_transfer, power_spectrum
+from workbench.identification.signal.frequency_responses import frequency_responses
 from workbench.records.record import Channel, Record
 from workbench.records.transfer_functions import TransferFunctions
 
@@ -57,3 +58,30 @@ def test_spectrum_by_parts_is_that_of_the_whole(n):
     whole = welch(signal - signal.mean(), 100.0, nperseg=min(4096, max(n // 4, 1)))
     np.testing.assert_array_equal(lines, whole[0])
     np.testing.assert_allclose(power, whole[1], rtol=1e-12, atol=1e-15)
+
+
+def test_responses_to_several_inputs_have_a_panel_per_output_and_a_line_per_input():
+    """Truth: each output is the sum of the inputs, through gains."""
+    rng, gains = np.random.default_rng(0), np.array([[2.0, -5.0], [0.5, 10.0], [4.0, 1.0]])
+    u = rng.standard_normal((2, 20_000))
+    channels = tuple(Channel(f"y{j}", "acceleration") for j in range(3))
+    found = frequency_responses([Record(0.01, gains @ u, channels, u, (Channel("F", "force"), Channel("G", "force")))])
+    lines = np.linspace(0.1, 49.0, 200)
+    fitted = TransferFunctions(np.repeat(gains[..., None], 200, axis=2), lines, channels, ("F", "G"))
+    *panels, coherence = plot_frf_of_inputs(found, fitted).axes
+    assert len(panels) == 3 and panels[0].get_ylabel() == "|y0 / input|\n[(m/s²)/N]"
+    for panel, row in zip(panels, np.abs(gains), strict=True):
+        assert [line.get_linestyle() for line in panel.lines] == ["-", "-", "--", "--"]
+        for line, gain in zip(panel.lines, [*row, *row], strict=True):
+            np.testing.assert_allclose(line.get_ydata(), gain, rtol=1e-6)
+    assert coherence.get_xlabel() == "frequency [Hz]" and len(coherence.lines) == 3
+    assert all(line.get_ydata().min() > 0.999999 for line in coherence.lines)
+
+
+def test_inputs_of_different_units_have_theirs_in_the_legend():
+    u = np.random.default_rng(0).standard_normal((2, 20_000))
+    inputs = (Channel("F", "force"), Channel("M", "moment"))
+    found = frequency_responses([Record(0.01, u[:1], (Channel("y", "displacement"),), u, inputs)])
+    panel = plot_frf_of_inputs(found).axes[0]
+    assert panel.get_ylabel() == "|y / input|\n[m per unit of input]"
+    assert [line.get_label() for line in panel.lines] == ["F [N]", "M [N m]"]

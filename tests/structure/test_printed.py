@@ -138,9 +138,11 @@ def test_a_plate_prints_its_edges_and_the_values_of_its_fields():
     lines = str(wb.Plate(**thing, poisson_ratio=0.3, edges=sides)).splitlines()
     around = "left clamped, right free, bottom simply supported, top on springs of 5 N/m² and 0 N"
     assert lines[0] == f"plate, 1.2 by 0.8 m, {around}, Poisson's ratio 0.3"
-    assert lines[2].split() == ["mass_per_area", "10", "10.6", "11.2"]
+    assert lines[2].split() == ["mass", "per", "area", "[kg/m²]", "10", "10.6", "11.2"]
+    assert lines[3].split() == ["bending", "stiffness", "[N", "m]", "100", "100", "100"]
     membrane = wb.Membrane(length=(1.0, 2.0), mass_per_area=1.0, tension=3.0)
     assert repr(membrane) == "<Membrane: membrane, 1 by 2 m, all edges fixed>"
+    assert str(membrane).splitlines()[3].split() == ["tension", "[N/m]", "3", "3", "3"]
 
 
 def test_a_case_is_a_table_of_its_records(rig, record):

@@ -18,15 +18,18 @@ from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.report.budget import Budget
 from workbench.gap.report.verdict import Verdict
 from workbench.records.record import Record
-from workbench.rig.actuators import command_unit
+from workbench.records.units import Units
+from workbench.rig.actuators import Actuator, force_unit
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict
 from workbench.structure.domain import Between, NamedPoints, Rectangle, Where
+from workbench.structure.printed import joined_in_words
 
 MOST_BARS, FEW_BARS = 16, 6  # named points that are shown; sensors whose names fit horizontally
 YELLOW = "#F0E442"  # of the same palette; a second grey is not to be told from the first on a dark page
 SHOWN = 0.005  # least share of the gap that is drawn
 BELOW = "log-likelihood below its maximum [-]"
+STUB = 0.4  # of `ALIKE`, where the bars of named points begin
 ALIKE = 0.1  # difference of log-likelihoods up to which places are drawn as equally likely
 MAP_LEVELS = 13
 
@@ -113,9 +116,8 @@ def plot_where(verdict: Verdict) -> Figure:
     for i in order:
         at = (where.input_levels[i], where.record_gaps[i])
         by_level.annotate(where.record_names[i], at, (0, 6), textcoords="offset points", ha="center", fontsize=8)
-    unit = verdict.units.named(command_unit(verdict.nominal.actuators))
-    by_level.set(title="by record and level", ylabel="gap (rms error / rms signal)")
-    by_level.set_xlabel(f"rms of the inputs [{unit}]" if unit else "rms of the inputs")
+    by_level.set(title="by record and level", ylabel="gap (rms error / rms signal) [-]")
+    by_level.set_xlabel(f"rms of the inputs [{units_of_inputs(verdict.nominal.actuators, verdict.units)}]")
     by_level.set(xscale="log", yscale="log")
     by_time.imshow(100 * where.time_shares, aspect="auto", cmap="Blues", vmin=0.0, extent=(0, 8, len(order), 0))
     by_time.set(title="by time: darker is more of the record's gap", xlabel="eighth of the record")
@@ -125,6 +127,12 @@ def plot_where(verdict: Verdict) -> Figure:
     plain_ticks(figure)
     _plot_places(by_place, verdict)
     return figure
+
+
+def units_of_inputs(actuators: Sequence[Actuator], units: Units) -> str:
+    """The units of all commands, such as N and N m; "unit of the command" where an actuator has a gain."""
+    named = [units.named(force_unit(a)) if a.gain == 1 else "unit of the command" for a in actuators]
+    return joined_in_words([*dict.fromkeys(named)])
 
 
 def _plot_modes(ax: Axes, verdict: Verdict) -> None:
@@ -178,25 +186,27 @@ def _rank(ax: Axes, verdict: Verdict) -> None:
     """The likeliest named points with their difference in log-likelihood; places of named effects are marked."""
     place, separation = verdict.where.place, verdict.nominal.modes.domain.separation
     shown = [place.places[i] for i in np.argsort(-place.profile, kind="stable")[:MOST_BARS]]
-    below = place.profile.max() - np.sort(place.profile)[::-1][:MOST_BARS]
+    below, most = _below(place.profile)
+    below = np.sort(below)[:MOST_BARS]
     acting, called = _acting(verdict)
     is_acting = [any(separation(at, other) == 0 for other in acting) for at in shown]
     colours = [COLOURS[0] if named else COLOURS[3] for named in is_acting]
-    ax.barh(range(len(shown)), below, height=0.4, color=colours)
-    for i, colour in enumerate(colours):  # the bars of points that fit as well as the likeliest have no length
-        ax.plot(below[i], i, "o", color=colour, clip_on=False)
+    # from below the least difference that is drawn: the bars of points that fit alike are short, but seen
+    ax.barh(range(len(shown)), below - STUB * ALIKE, left=STUB * ALIKE, height=0.6, color=colours)
     names = [_short(at) + f" ({called})" * named for at, named in zip(shown, is_acting, strict=True)]
     ax.set_yticks(range(len(shown)), names, fontsize=8)
     ax.invert_yaxis()
-    ax.set_xscale("symlog", linthresh=1.0, linscale=0.5)
-    top = int(np.ceil(np.log10(max(below.max(), 10.0))))
-    ax.set_xticks([0.0, *10.0 ** np.arange(0, top + 1, 1 + top // 6)])
-    ax.set(xlim=(0.0, 10.0**top), xlabel=BELOW)
-    ax.annotate("likeliest", (0.0, 0), (8, 0), textcoords="offset points", va="center", fontsize=8)
+    ticks = _decades(most)
+    ax.set(xscale="log", xlim=(STUB * ALIKE, 1.5 * most), xlabel=BELOW)
+    ax.set_xticks(ticks, _numbered(ticks))
+    ax.xaxis.set_minor_locator(NullLocator())
+    for i in np.flatnonzero(below <= ALIKE):
+        text = "as likely" if i else "likeliest"
+        ax.annotate(text, (ALIKE, i), (6, 0), textcoords="offset points", va="center", fontsize=8)
     unseen = [_short(at) for at in acting if all(separation(at, other) > 0 for other in shown)]
     if unseen:
         label = f"{called}, not among these: {', '.join(unseen)}"
-        ax.text(1.0, 0, label, transform=ax.get_yaxis_transform(), ha="right", va="center", fontsize=8)
+        ax.text(1.4 * most, 0, label, ha="right", va="center", fontsize=8)
 
 
 def _acting(verdict: Verdict) -> tuple[list[Any], str]:

@@ -10,6 +10,7 @@ from scipy.signal import coherence, csd, welch
 from workbench.arrays import Floats
 from workbench.draw.style import COLOURS, GREY, envelope, in_units, new_figure
 from workbench.identification.signal.distortion import Distortion
+from workbench.identification.signal.frequency_responses import FrequencyResponses
 from workbench.records.record import Channel, Record
 from workbench.records.transfer_functions import TransferFunctions
 
@@ -20,6 +21,8 @@ DISTORTION_LIMIT = 4.0  # highest frequency of a figure of distortion, over the 
 SEGMENTS_IN_MEMORY = 256  # at once
 SEGMENTS = 4  # of a record, at least
 MOST_PANELS = 12
+MOST_INPUTS = 6  # whose responses are drawn in one panel
+MEASURED = 0.4  # opacity of measured responses under those of modes
 # of the lines of one panel: the colours repeat after seven
 DASHES = [*["-"] * len(COLOURS), *["--"] * (MOST_PANELS - len(COLOURS))]
 
@@ -167,6 +170,60 @@ def plot_frf(record: Record) -> Figure:
     axes[0].set(ylabel=label, title="frequency response (H1)")
     axes[0].legend(ncols=4, fontsize=8)
     return figure
+
+
+def plot_frf_of_inputs(found: FrequencyResponses, fitted: TransferFunctions | None = None) -> Figure:
+    """Frequency responses to several inputs, a panel per output and a line per input, and the multiple coherence.
+
+    Args:
+        fitted: those of the identified modes, at any frequencies, drawn dashed.
+    """
+    measured, same = found.transfer, len(set(found.units)) == 1
+    named = [name if same or not unit else f"{name} [{unit}]" for name, unit in zip(measured.references, found.units)]
+    channels, n = measured.output_channels, len(measured.output_channels)
+    figure, axes = new_figure(n + 1, 1, width=9, height=2.0 + 2.1 * n, sharex=True, height_ratios=[3] * n + [2])
+    for j, (ax, channel) in enumerate(zip(axes, channels)):
+        for name, row, colour in zip(named[:MOST_INPUTS], measured.values[j], COLOURS):
+            faint = {"alpha": MEASURED, "linewidth": 1.2} if fitted is not None else {"linewidth": 0.9}
+            ax.semilogy(measured.frequencies_hz, _nonzero(row), color=colour, label=name, **faint)
+        for name, colour in zip(measured.references[:MOST_INPUTS] if fitted is not None else (), COLOURS):
+            if fitted is not None and name in fitted.references:
+                row = fitted.values[fitted.output_names.index(channel.name), fitted.references.index(name)]
+                look = {"color": colour, "linestyle": "--", "linewidth": 1.4}
+                ax.semilogy(fitted.frequencies_hz, _nonzero(row), label=f"{name}, modes", **look)
+        drawn = np.concatenate([_nonzero(row) for row in measured.values[j, :MOST_INPUTS]])
+        if np.isfinite(drawn).any():  # single lines of noise, and zeros of a model, may be far lower
+            ax.set_ylim(
+                0.3 * np.nanquantile(drawn, 0.005), 3.0 * np.nanmax([np.nanmax(drawn), _peak(fitted, channel.name)])
+            )
+        ax.set_ylabel(in_units(f"|{channel.name} / input|", _per_input(channel.unit, found.units)))
+    colours = COLOURS[3:] + COLOURS[:3]  # of outputs: those above are of inputs
+    for channel, row, colour in zip(channels, found.coherence, colours):
+        axes[-1].plot(measured.frequencies_hz, row, linewidth=0.9, color=colour, label=channel.name)
+    axes[-1].set(xlabel="frequency [Hz]", ylabel="coherence [-]", ylim=(0.0, 1.05))
+    axes[0].set_title("frequency responses (H1), to each input")
+    axes[-1].set_title("multiple coherence of each output")
+    for ax in (axes[0], axes[-1]):
+        ax.legend(ncols=6, fontsize=8)
+    return figure
+
+
+def _nonzero(row: np.ndarray) -> Floats:
+    """Magnitudes, NaN for zeros, which a logarithmic axis cannot show."""
+    return np.where(np.abs(row) > 0, np.abs(row), np.nan)
+
+
+def _peak(fitted: TransferFunctions | None, output: str) -> float:
+    """The largest magnitude to an output; NaN without any."""
+    return np.nan if fitted is None else float(np.abs(fitted.values[fitted.output_names.index(output)]).max())
+
+
+def _per_input(unit: str, of_inputs: Sequence[str]) -> str:
+    """The unit of an output over that of inputs; "" where one is unknown."""
+    if not unit or "" in of_inputs:
+        return ""
+    top, over = (f"({part})" if "/" in part or " " in part else part for part in (unit, of_inputs[0]))
+    return f"{top}/{over}" if len(set(of_inputs)) == 1 else f"{unit} per unit of input"
 
 
 def plot_distortion(distortions: Sequence[Distortion]) -> Figure:

@@ -27,6 +27,7 @@ from workbench.structure.surface_basis import EdgeSpring, PointTerm, Square, Sur
 from workbench.structure.surface_ritz import solve
 
 SAMPLES = 41  # per side, at which a field is checked to be positive
+FIELD_UNITS = {"mass_per_area": "kg/m²", "bending_stiffness": "N m", "tension": "N/m"}
 SAME_POINT = 1e-6  # of a side: attachments nearer to one another are at one point
 
 
@@ -47,7 +48,10 @@ class _Surface(Printed):
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         sides = np.multiply.outer([0.0, 0.5, 1.0], self.length)
         quantities = {name: value for name, value in vars(self).items() if isinstance(value, Field)}
-        rows = [(name, *(f"{v:.4g}" for v in quantity(*sides.T))) for name, quantity in quantities.items()]
+        rows = [
+            (f"{name.replace('_', ' ')} [{FIELD_UNITS[name]}]", *(f"{v:.4g}" for v in quantity(*sides.T)))
+            for name, quantity in quantities.items()
+        ]
         edges = {side: _edge_text(edge, self._held) for side, edge in self.edges.items()}
         alike = len(set(edges.values())) == 1
         around = f"all edges {edges['left']}" if alike else ", ".join(f"{side} {edge}" for side, edge in edges.items())

@@ -11,7 +11,7 @@ import numpy as np
 from workbench.cases.case import read_case
 from workbench.design.loop.closed_loop import DRIFTS, stability
 from workbench.draw.design import plot_poles, plot_work_linear
-from workbench.draw.gap import plot_gaps, plot_responses
+from workbench.draw.gap import plot_gaps, plot_responses, units_of_inputs
 from workbench.draw.identification import plot_deviations, plot_mac, stabilisation_diagram
 from workbench.draw.motion import mode_motion
 from workbench.draw.placement import plot_places
@@ -25,6 +25,7 @@ from workbench.structure.modes import SampledModes, mac
 from workbench.structure.printed import command_headings, counted, joined_in_words, places_text
 from workbench.study.catalogue import find_study, output_root
 from workbench.study.pages.identification_report import IdentificationReport
+from workbench.study.pages.inputs_at_once import responses_to_inputs
 from workbench.study.pages.page import (
     FORMAT,
     PageContent,
@@ -81,13 +82,14 @@ def case_page_content(folder: Path) -> PageContent:
         (r.name, "fit" if r in case.fit else "validate", r.n_samples, r.sample_rate_hz, float(r.inputs.std()))
         for r in records
     ]
+    level = f"input rms [{units_of_inputs(rig.actuators, case.units)}]"
     modes = list(zip(range(1, rig.modes.n_modes + 1), rig.modes.frequencies_hz.tolist(), rig.modes.zeta.tolist()))
     return PageContent(
         title=f"Case {case.name}, before any diagnosis",
         lines=(f"{len(rig.actuators)} inputs, {len(rig.sensors)} sensors, {len(records)} records.",),
         blocks=[*moving_modes(rig, {"nominal": rig.modes}), block(beside, caption)],
         tables=[
-            ("Records", ("record", "use", "samples", "sample rate [Hz]", "input rms"), rows),
+            ("Records", ("record", "use", "samples", "sample rate [Hz]", level), rows),
             ("Nominal modes", ("mode", "frequency [Hz]", "damping ratio"), modes),
         ],
         inputs=case_inputs(folder),
@@ -377,7 +379,7 @@ def identification_page(
 ) -> PageContent:
     """The page of an identification report and its data; transfer functions are shown over the fitted band."""
     content = identified({**report.content, "heading": report.heading, "lines": list(report.lines)})
-    blocks = [*content.pop("blocks"), *_stabilisation(report), *_response(measured[0], report.fitted)]
+    blocks = [*content.pop("blocks"), *_stabilisation(report), *_response(measured, report.fitted)]
     return PageContent(title="Identified modes", blocks=blocks, made_by=made_by, **content)
 
 
@@ -395,7 +397,8 @@ def _stabilisation(report: IdentificationReport) -> list[dict[str, Any]]:
     return [block(figure, STABLE)]
 
 
-def _response(measured: Record | TransferFunctions, fitted: TransferFunctions | None) -> list[dict[str, Any]]:
+def _response(every: Sequence[Record | TransferFunctions], fitted: TransferFunctions | None) -> list[dict[str, Any]]:
+    measured, why_not = every[0], ""
     if isinstance(measured, TransferFunctions):
         if fitted is not None:
             kept = np.isin(measured.frequencies_hz, fitted.frequencies_hz)
@@ -411,4 +414,9 @@ def _response(measured: Record | TransferFunctions, fitted: TransferFunctions | 
             block(beside, f"{measured_by}, and of the identified modes (dashed).{rest}"),
             block(plot_coherence(measured.select_outputs(names)), "Coherence of each sensor with the input."),
         ]
-    return [block(plot_spectra(measured), f"Power spectral density of {measured.name}, by Welch's method.")]
+    if measured.n_inputs > 1 and fitted is not None:
+        shown, why_not = responses_to_inputs([one for one in every if isinstance(one, Record)], fitted)
+        if shown:
+            return shown
+    caption = f"Power spectral density of {measured.name}, by Welch's method. {why_not}".rstrip()
+    return [block(plot_spectra(measured), caption)]

@@ -10,19 +10,22 @@ from scipy.integrate import simpson
 
 from workbench.cases.case import read_units
 from workbench.cases.nominal import read_rig
-from workbench.design.estimation.modal_filter import filter_on
+from workbench.design.estimation.controller import filtered
+from workbench.design.estimation.modal_filter import ModalFilter, filter_on
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.loop.closed_loop import ClosedLoop, Response, close_loop, impulse_state, initial_response
 from workbench.design.placement.task import patch_of
+from workbench.design.spillover.explain import explain_spillover
 from workbench.design.spillover.spillover import Spillover, finite_spillover
 from workbench.draw.motion import frame_net
 from workbench.records.units import SI, Units
 from workbench.rig.actuators import Actuator, command_unit
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Domain, Interval, NamedPoints, Place, Rectangle, centred_at, middle, reach
-from workbench.structure.printed import all_rounded, command_headings
+from workbench.structure.modes import Modes
+from workbench.structure.printed import all_rounded, command_headings, joined_in_words
 from workbench.study.runs.cases import StudyError
 
 LAWS = ("IMSC", "coupled LQR")
@@ -203,16 +206,27 @@ def try_out(rig: Rig, design: Design) -> Tried:
     loop = close_loop(modes, law, through)
     fastest = float(loop.poles.real.max())
     if fastest * design.final_time > MOST_GROWTH:
-        raise DesignError(
-            f"the loop is unstable, with a pole at {fastest:+.3g} rad/s: control and observation spillover of residual"
-            " modes, if they have little damping; move or add sensors, or raise R"
-        )
+        raise DesignError(_instability(modes, law, through, fastest))
     state = impulse_state(modes, design.impulse_at)
     at_rest = state.copy()
     at_rest[modes.n_modes + design.controlled :] = 0.0  # so that W_r is the energy that control adds to the mode
     response = initial_response(loop, np.linspace(0.0, design.final_time, N_TIMES), state)
     effort = float(simpson((response.forces**2).sum(axis=0), x=response.time))
     return Tried(law, loop, response, finite_spillover(loop, at_rest, design.final_time), effort)
+
+
+def _instability(modes: Modes, law: Law, through: ModalFilter | None, fastest: float) -> str:
+    """The message about an unstable loop: its residual modes that grow, and whether it is stable without any."""
+    found = f"the loop is unstable, with a pole of real part {fastest:+.3g} 1/s"
+    if through is None:
+        return f"{found}; raise R, or move actuators"
+    told = explain_spillover(modes, filtered(law, through))
+    growing = [str(1 + one.mode) for one in told.shifts if one.closed_pole.real > 0.0]
+    if growing:
+        found += f": residual mode{'s' * (len(growing) > 1)} {joined_in_words(growing)} grow{'s' * (len(growing) == 1)}"
+    rate = told.reduced_decay_rate
+    alone = "stable" if rate > 0.0 else f"not stable either, of decay rate {rate:.3g} 1/s"
+    return f"{found}; without residual modes it is {alone}; move or add sensors, or raise R"
 
 
 def _kind(rig: Rig, at: Place) -> Actuator:

@@ -37,8 +37,8 @@ class IdentificationReport:
         lines: remarks.
         content: for JSON.
         decays: the free decays, or the correlation functions, that were fitted; empty for other data.
-        fitted: transfer functions of the model, at the fitted lines, or of records of one input up to half the sample
-            rate; None for other data.
+        fitted: transfer functions of the model, at the fitted lines, or of driven records up to half the sample rate;
+            None for other data.
     """
 
     heading: str
@@ -150,7 +150,7 @@ def of_driven(found: Driven, records: Sequence[Record]) -> IdentificationReport:
         "noise_std": found.noise_std,
         "converged": found.converged,
     }
-    return replace(_report(records, found, lines, content), fitted=_model_of(found) if len(found.delays) == 1 else None)
+    return replace(_report(records, found, lines, content), fitted=_model_of(found))
 
 
 def _model_of(found: Driven) -> TransferFunctions:

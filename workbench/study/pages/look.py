@@ -20,6 +20,7 @@ from workbench.identification.signal.data_quality import DataFault, data_faults,
 from workbench.records.record import Channel, Record
 from workbench.records.transfer_functions import TransferFunctions
 from workbench.structure.printed import counted
+from workbench.study.pages.inputs_at_once import responses_to_inputs
 from workbench.study.pages.page import PageContent, block
 
 HEADINGS = ("channel", "quantity", "smallest", "largest", "mean", "std", "strongest at [Hz]")
@@ -98,14 +99,16 @@ def _record(record: Record, path: Path) -> Look:
     if kept or forces:
         moving = record.select_outputs([name for name in record.output_names if name not in faulty])
     driven = moving.n_inputs == 1 and bool(np.ptp(moving.inputs)) and moving.n_samples >= 16 * SEGMENTS
+    at_once, why_not = responses_to_inputs([moving]) if moving.n_inputs > 1 and moving.n_outputs else ([], "")
     page_content = PageContent(
         title=f"What {path.name} holds",
         lead=heading,
         lines=[*remarks, f"Go on with: {command}"],
         blocks=[
             block(plot(record), "The signals as recorded."),
-            block(plot_spectra(moving), "Power spectral density, by Welch's method."),
+            block(plot_spectra(moving), f"Power spectral density, by Welch's method. {why_not}".rstrip()),
             *([block(plot_frf(moving), "Frequency response functions and coherence.")] if driven else []),
+            *at_once,
         ],
         tables=[("Channels", HEADINGS, rows)],
         made_by=f"workbench look {path}",
