@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import cont2discrete, lfilter, ss2tf
+from scipy.signal import cheby2, cont2discrete, lfilter, ss2tf
 
 from workbench.identification.signal.frequency_responses import frequency_responses, loudest
 from workbench.records.record import Channel, Record
@@ -102,3 +102,14 @@ def test_the_loudest_outputs_come_first_each_beside_those_of_its_quantity():
     rows = np.array([1.0, 3.0, 2.0, 500.0])[:, None] * np.random.default_rng(7).standard_normal(1000)
     channels = (*OUTPUTS, Channel("a", "acceleration"))
     assert loudest(Record(0.01, rows, channels), 3) == ("y2", "a", "y3")
+
+
+def test_lines_that_the_inputs_hardly_excite_show_no_response_to_noise():
+    """Inputs up to 20 Hz, and noise of the sensors at all frequencies."""
+    numerator, denominator = cheby2(10, 70.0, 0.5)
+    u = lfilter(numerator, denominator, np.random.default_rng(4).standard_normal((2, 100_000)))
+    found = frequency_responses([record(u, noise=0.05)])
+    hertz, shown = found.transfer.frequencies_hz, np.isfinite(found.transfer.values).all(axis=(0, 1))
+    assert shown[hertz < 12.0].all() and not shown[hertz > 26.0].any()
+    assert np.isnan(found.coherence[:, hertz > 26.0]).all()
+    assert np.isfinite(frequency_responses([record(u)]).transfer.values).all(), "without noise all are coherent"

@@ -24,6 +24,7 @@ class SpectraSettings:
     alike: float = 0.95  # coherence of an input with the others above which it varies H more than 20-fold, 1 / (1 - γ²)
     silent: float = 1e-12  # power of an input over its largest, below which a line is not excited
     excited: float = 1e-4  # power of an input over its largest, above which a line tells whether inputs are alike
+    coherent: float = 0.5  # least coherence of any output at a line that the inputs excite less
 
 
 SPECTRA = SpectraSettings()
@@ -34,7 +35,8 @@ class FrequencyResponses:
     """H1 of several inputs with its coherence.
 
     Attributes:
-        transfer: NaN where an input is silent, or not to be told from the others.
+        transfer: NaN where an input is silent, or not to be told from the others, and where the inputs are weak and no
+            output is coherent with them.
         coherence: (n_outputs, n_lines) multiple coherence of each output with all inputs, in [0, 1], NaN as above.
         averages: number of segments, which overlap by half.
         units: one per input.
@@ -87,6 +89,8 @@ def frequency_responses(records: Sequence[Record]) -> FrequencyResponses:
     outputs = spectra[n:, n:].diagonal().real  # (n_lines, n_outputs)
     explained = np.einsum("fji,fji->fj", scaled, (across / scales[:, None]).conj()).real
     coherence = np.divide(explained, outputs, out=np.full_like(explained, np.nan), where=outputs > 0.0)
+    excited = (powers > SPECTRA.excited * powers.max(axis=0)).all(axis=1)
+    apart &= excited | (coherence > SPECTRA.coherent).any(axis=1)
     values = np.where(apart[:, None, None], scaled / scales[:, None], np.nan)
     found = TransferFunctions(values.transpose(1, 2, 0), lines, first.output_channels, names, name=first.name)
     coherence = np.where(apart[:, None], np.clip(coherence, 0.0, 1.0), np.nan).T
