@@ -264,6 +264,9 @@ class StepwiseSettings:
     # likewise if nominal errors alone are plausible and explain the records: of 19 trials without an effect none saved
     # over 3, of 13 with one that nominal errors had absorbed five saved 15 to 140
     fewer_words: float = 10.0
+    # likewise, beyond which it need not be likelier than errors that over-fit: where nothing hides 10 and 19 were
+    # saved, by masses and losses of stiffness 34 to 39
+    far_fewer_words: float = 25.0
     singles: int = 3  # single effects that are tried as the first
     candidates: int = 4  # sets fitted to the most informative records at each step
     # finalists, near: sets that are fitted to all records, and the largest ratio of their cost to the least

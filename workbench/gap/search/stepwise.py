@@ -336,10 +336,18 @@ class Stepwise:
         if not shorter:
             return
         # iterated as far as the effects, the errors alone may describe the records as briefly
-        errors_only = fit_jointly(self.search, (), errors_only.errors, rounds=3, until_convergence=True)
-        length_limit = errors_only.description(noise) - STEPWISE.fewer_words
-        shorter = [s for s in shorter if s.description(noise) < length_limit]
-        found = [s for s in shorter if is_likelier(self.search, s, errors_only, least=SEARCH.trifle)]
+        converged = fit_jointly(self.search, (), errors_only.errors, rounds=3, until_convergence=True)
+        shortest = min(step.description(noise) for step in (errors_only, converged))
+
+        def is_found(step: Step) -> bool:
+            saved = shortest - step.description(noise)
+            likelier = partial(is_likelier, self.search, step, least=SEARCH.trifle)
+            # errors iterated that far over-fit: an effect that saves much need not be likelier than those
+            return saved > STEPWISE.fewer_words and (
+                likelier(converged) or (saved > STEPWISE.far_fewer_words and likelier(errors_only))
+            )
+
+        found = [s for s in shorter if is_found(s)]
         if found:
             best = min(found, key=lambda s: s.description(noise))
             if self.search.are_noticeable(best.effects, best.fit.effects):
