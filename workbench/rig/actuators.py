@@ -124,6 +124,11 @@ def mixing(actuators: Sequence[Actuator]) -> Floats:
     return mixed(actuators, np.eye(len(actuators)))
 
 
+def linear_actuator(actuator: Actuator) -> Actuator:
+    """The actuator with its gain, delay, lag and cross-talk alone."""
+    return replace(actuator, dead_zone=0.0, limit=np.inf, rate_limit=np.inf, hysteresis_share=0.0, bias=0.0)
+
+
 def without_crosstalk(actuators: Sequence[Actuator]) -> tuple[Actuator, ...]:
     """The actuators, each with its own command alone."""
     return tuple(replace(a, crosstalk=()) if a.crosstalk else a for a in actuators)

@@ -1,6 +1,6 @@
 """Sensors: quantity, place and imperfections."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -78,3 +78,8 @@ class Sensor(Constructed):
     def has_state_space(self) -> bool:
         """Whether the reading is linear in the measured quantities with finitely many states, so without a delay."""
         return bool(np.isinf(self.limit) and not (self.bias or self.drift or self.step or self.delay))
+
+
+def linear_sensor(sensor: Sensor) -> Sensor:
+    """The sensor with its gain, delay, lag and cross-talk alone, and its noise."""
+    return replace(sensor, bias=0.0, drift=0.0, limit=np.inf, step=0.0)

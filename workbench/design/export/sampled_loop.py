@@ -16,8 +16,8 @@ from scipy.linalg import expm
 from workbench.arrays import Floats, Integers
 from workbench.design.estimation.digital import DigitalController, zero_order_hold
 from workbench.design.laws.law import DesignError
-from workbench.rig.actuators import Actuator, mixing, without_crosstalk
-from workbench.rig.sensors import Sensor
+from workbench.rig.actuators import Actuator, linear_actuator, mixing, without_crosstalk
+from workbench.rig.sensors import Sensor, linear_sensor
 from workbench.rig.statespace import state_space
 from workbench.structure.modes import Modes
 
@@ -129,10 +129,7 @@ def linear_plant(
 
     Commands come after the cross-talk of the actuators, which precedes their delays.
     """
-    linear_actuators = [
-        replace(a, delay=0.0, dead_zone=0.0, limit=np.inf, rate_limit=np.inf, hysteresis_share=0.0, bias=0.0)
-        for a in without_crosstalk(actuators)
-    ]
-    linear_sensors = [replace(s, bias=0.0, drift=0.0, limit=np.inf, step=0.0) for s in sensors]
+    linear_actuators = [replace(linear_actuator(a), delay=0.0) for a in without_crosstalk(actuators)]
+    linear_sensors = [linear_sensor(s) for s in sensors]
     plant = state_space(modes, linear_actuators, linear_sensors)
     return np.asarray(plant.A), np.asarray(plant.B), np.asarray(plant.C)

@@ -20,7 +20,9 @@ from workbench.gap.effects.effect import (
     place_values,
 )
 from workbench.records.record import QUANTITIES
+from workbench.rig.actuators import linear_actuator
 from workbench.rig.rig import Rig
+from workbench.rig.sensors import linear_sensor
 from workbench.rig.simulate import predict
 from workbench.structure.domain import Interval, NamedPoints, Where, centred_at, reach
 
@@ -360,11 +362,8 @@ def _responses_to_share(evidence: Evidence, pair: tuple[str, str]) -> list[np.nd
         rig = evidence.rig.in_record(record.name)
         linear = replace(
             rig,
-            actuators=tuple(
-                replace(a, dead_zone=0.0, limit=np.inf, rate_limit=np.inf, hysteresis_share=0.0, bias=0.0)
-                for a in rig.actuators
-            ),
-            sensors=tuple(replace(s, bias=0.0, drift=0.0, limit=np.inf, step=0.0) for s in rig.sensors),
+            actuators=tuple(linear_actuator(a) for a in rig.actuators),
+            sensors=tuple(linear_sensor(s) for s in rig.sensors),
             elements=(),
             stiffness_rate=0.0,
         )

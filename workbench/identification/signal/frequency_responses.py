@@ -84,12 +84,12 @@ def frequency_responses(records: Sequence[Record]) -> FrequencyResponses:
     inverse = np.linalg.inv(np.where(heard[:, None, None], alike, 0.0) + 1e-12 * np.eye(n))
     with_others: Floats = np.asarray(1.0 - 1.0 / inverse.diagonal(axis1=1, axis2=2).real, np.float64)
     apart = heard & (with_others < SPECTRA.alike).all(axis=1)
-    _check_apart(names, alike, with_others, heard, powers)
+    excited = heard & (powers > SPECTRA.excited * powers.max(axis=0)).all(axis=1)
+    _check_apart(names, alike, with_others, excited)
     scaled = (across / scales[:, None]) @ inverse
     outputs = spectra[n:, n:].diagonal().real  # (n_lines, n_outputs)
     explained = np.einsum("fji,fji->fj", scaled, (across / scales[:, None]).conj()).real
     coherence = np.divide(explained, outputs, out=np.full_like(explained, np.nan), where=outputs > 0.0)
-    excited = (powers > SPECTRA.excited * powers.max(axis=0)).all(axis=1)
     apart &= excited | (coherence > SPECTRA.coherent).any(axis=1)
     values = np.where(apart[:, None, None], scaled / scales[:, None], np.nan)
     found = TransferFunctions(values.transpose(1, 2, 0), lines, first.output_channels, names, name=first.name)
@@ -115,9 +115,8 @@ def _averaged(records: Sequence[Record], active: Sequence[int], segment: int) ->
     return total / count, count
 
 
-def _check_apart(names: Sequence[str], alike: np.ndarray, with_others: Floats, heard: Flags, powers: Floats) -> None:
+def _check_apart(names: Sequence[str], alike: np.ndarray, with_others: Floats, excited: Flags) -> None:
     """Raise where, at half of the lines that all inputs excite, an input follows from the others."""
-    excited = heard & (powers > SPECTRA.excited * powers.max(axis=0)).all(axis=1)
     if not excited.any():
         raise ValueError(f"no frequency is excited by all of the inputs {joined_in_words(names)}")
     if np.median(with_others[excited].max(axis=1)) < SPECTRA.alike:
