@@ -235,6 +235,7 @@ class Kind:
         more_general: effect -> effects that it is a limiting case of and that records can mistake for it, with start
             values.
         merged: effect, another -> the one effect that both together may be, with start values; or None.
+        other_starts: effect, rig -> the same with other start values, where a fit from these may end in another minimum.
         signed: whether the change is linear in its one parameter, of either sign, so that one start is enough.
         found_in: "search" if it is found by fits; "readings" if it shows in the readings themselves; "residual" if
             only the statistics of the residual show it.
@@ -267,6 +268,7 @@ class Kind:
     simpler: Callable[["Effect", Rig], Iterable["Effect"]] = lambda effect, rig: ()
     more_general: Callable[["Effect"], Iterable["Effect"]] = lambda effect: ()
     merged: "Callable[[Effect, Effect], Effect | None]" = lambda effect, other: None
+    other_starts: Callable[["Effect", Rig], Iterable["Effect"]] = lambda effect, rig: ()
     signed: bool = False
     found_in: Literal["search", "readings", "residual"] = "search"
     exclusive: bool = False
@@ -488,6 +490,13 @@ def merged_sets(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
         merged = one.kind.merged(one, other)
         if merged is not None:
             yield (*(effect for effect in effects if effect is not one and effect is not other), merged)
+
+
+def from_other_starts(effects: Sequence[Effect], rig: Rig) -> Iterator[tuple[Effect, ...]]:
+    """The sets with one effect at other start values, where its fit may end in another minimum."""
+    for i, effect in enumerate(effects):
+        for other in effect.kind.other_starts(effect, rig):
+            yield (*effects[:i], other, *effects[i + 1 :])
 
 
 def simpler_sets(effects: Sequence[Effect], rig: Rig) -> Iterator[tuple[Effect, ...]]:

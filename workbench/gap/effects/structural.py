@@ -32,6 +32,7 @@ RESOLUTION, ROUGHLY = 1e-6, 1e-4  # relative tolerance of a frequency; of the hi
 MODES_CLOSED_FORM = 60  # modes of a plate in closed form, for each that is needed
 MODES_SOLVED, EXTRA_MODES = 3, 20  # of other plates: modes solved to a tolerance, and further ones without it
 EDGE = 1e-9  # of the length: tolerance at the ends
+OTHER_WIDTH = 1.5  # ratio of the width of a local loss to that of its start values, from which a fit may end elsewhere
 NEAR_HINGE = 0.1  # of the length: a spring closer to a hinge acts as a rotational spring
 
 
@@ -300,11 +301,24 @@ def _loss_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
     )
 
 
+def _first_width(place: float, length: float) -> float:
+    return min(0.1 * length, 1.5 * place, 1.5 * (length - place))
+
+
 def _loss_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
     length = evidence.domain.size
     for x in (0.04, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.96):
         for loss in (0.003, 0.01, 0.03, 0.12, 0.45):
-            yield {"at": x * length, "width": min(0.1, 1.5 * x, 1.5 - 1.5 * x) * length, "loss": loss}
+            yield {"at": x * length, "width": _first_width(x * length, length), "loss": loss}
+
+
+def _over_first_width(effect: Effect, rig: Rig) -> Iterator[Effect]:
+    """The same added compliance over another width: of a narrow loss, records show no more than that compliance."""
+    at, width, loss = (effect.values[name] for name in ("at", "width", "loss"))
+    other = _first_width(at, rig.modes.domain.size)
+    if max(width, other) > OTHER_WIDTH * min(width, other) > 0.0:
+        added = loss / (1.0 - loss) * width / other
+        yield replace(effect, values={**effect.values, "width": other, "loss": added / (1.0 + added)})
 
 
 LOCAL_STIFFNESS_LOSS = Kind(
@@ -313,6 +327,7 @@ LOCAL_STIFFNESS_LOSS = Kind(
     parameters=_loss_parameters,
     apply=solved_once(_with_loss),
     starts=_loss_starts,
+    other_starts=_over_first_width,
     targets=lambda rig: (None,) if isinstance(rig.structure, Structure) else (),
     phrase="a local loss of stiffness",
 )

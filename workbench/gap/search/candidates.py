@@ -2,14 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect, apply_all, can_be, nearest_possible
+from workbench.gap.effects.effect import Effect, apply_all, can_be, from_other_starts, nearest_possible
 from workbench.gap.effects.nominal import JUST_LATE, in_group, nominal_errors
 from workbench.gap.effects.ports import SENSOR_DELAY, SENSOR_LAG
 from workbench.gap.search.fit import Chord, Fit, fit, slopes
-from workbench.gap.search.jointly import Step, fit_jointly
+from workbench.gap.search.jointly import Step, fit_jointly, loss
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import JOINT, STEPWISE
 
@@ -43,7 +44,13 @@ def fitted_to_all(search: Search, step: Step) -> Step:
 
 
 def fit_from_zero(search: Search, effects: Sequence[Effect]) -> Step:
-    """The effects and nominal errors that start from zero, fitted jointly to all records.
+    """The effects and nominal errors that start from zero, fitted jointly to all records; the best of other starts."""
+    sets = (effects, *from_other_starts(effects, search.rig))
+    return min((_fitted_from_zero(search, each) for each in sets), key=partial(loss, search))
+
+
+def _fitted_from_zero(search: Search, effects: Sequence[Effect]) -> Step:
+    """The effects from their start values, with nominal errors from zero.
 
     With wrong frequencies, a simulation drifts out of phase over a record, so one-step-ahead predictions are fitted
     first.
