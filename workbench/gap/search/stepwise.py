@@ -354,17 +354,14 @@ class Stepwise:
                 self.steps.append(replace(best, others=tuple(found)))
 
     def _add(self, most: int) -> None:
-        """Add effects one after the other, `most` in all."""
-        while len(self.last.effects) < most and not (self.is_sufficient and self._is_exhausted):
+        """Add effects one after the other, `most` in all, and exchange a single one for a better one."""
+        while len(self.last.effects) <= most and not (self.is_sufficient and self._is_exhausted):
             if self.search.is_over:
                 break
             before = self.last
-            step = (
-                self._with_another_law(before)
-                or self._at_another_place(before)
-                or self._with_an_absorbed(before)
-                or self._with_one_more(before)
-            )
+            step = self._with_another_law(before) or self._at_another_place(before)
+            if step is None and len(before.effects) < most:
+                step = self._with_an_absorbed(before) or self._with_one_more(before)
             if step is None:
                 break
             self.steps.append(step)
