@@ -235,7 +235,7 @@ class Kind:
         more_general: effect -> effects that it is a limiting case of and that records can mistake for it, with start
             values.
         merged: effect, another -> the one effect that both together may be, with start values; or None.
-        other_starts: effect, rig -> the same with other start values, where a fit from these may end in another minimum.
+        other_starts: effect, rig -> the same with other start values, where a fit may end in another minimum.
         signed: whether the change is linear in its one parameter, of either sign, so that one start is enough.
         found_in: "search" if it is found by fits; "readings" if it shows in the readings themselves; "residual" if
             only the statistics of the residual show it.
