@@ -148,7 +148,7 @@ def diagnose(
             as_wired,
             evidence,
             catalogue=catalogue,
-            report=progress,
+            progress=progress,
             uncertain_nominal=uncertain_nominal,
             tolerance=tolerance,
             identified=identified or IdentifiedPrior.of_modes(rig),

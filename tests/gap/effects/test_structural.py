@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import eigh
 
 from workbench.gap.effects.catalogue import kind_named
-from workbench.gap.effects.effect import Effect, apply_all, can_be
+from workbench.gap.effects.effect import Effect, apply_all, can_be, from_other_starts
 from workbench.gap.effects.structural import modes_of
 from workbench.rig.rig import Rig
 from workbench.structure.damping import ModalDamping
@@ -117,3 +117,16 @@ def test_a_loss_of_stiffness_that_leaves_the_structure_cannot_be():
     inside, outside = (Effect(kind, None, {"at": 0.07, "width": width, "loss": 0.1}) for width in (0.1, 0.16))
     assert can_be(rig, [inside])
     assert not can_be(rig, [inside, outside])
+
+
+@pytest.mark.parametrize(("width", "loss"), [(0.012, 0.5), (0.19, 0.02)])
+def test_a_loss_starts_over_another_width_with_its_added_compliance(width, loss):
+    """What a stretch far shorter than a wave adds to the compliance is all that lowers its frequency."""
+    beam = Beam(length=1.2, mass_per_length=0.5, bending_stiffness=8.0, left="hinged", right="hinged")
+    rig = Rig(beam.modes(2), (), (), structure=beam)
+    start = Effect(kind_named("local_stiffness_loss"), None, {"at": 0.43, "width": width, "loss": loss})
+    ((other,),) = from_other_starts((start,), rig)
+    assert other.values["width"] == pytest.approx(0.12)
+    lowered = [1.0 - apply_all(rig, (each,)).modes.omega / rig.modes.omega for each in (start, other)]
+    np.testing.assert_allclose(*lowered, rtol=0.1)
+    assert not list(from_other_starts((other,), rig))

@@ -12,7 +12,6 @@ from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, nominal_
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.search import jointly
-from workbench.gap.search.candidates import surely_late
 from workbench.gap.search.errors_as_effects import (
     NO_UNIFORM_ERROR,
     delay_effects,
@@ -22,6 +21,7 @@ from workbench.gap.search.errors_as_effects import (
 )
 from workbench.gap.search.fit import Fit, fit
 from workbench.gap.search.intervals import with_intervals
+from workbench.gap.search.joint_starts import surely_late
 from workbench.gap.search.jointly import fit_jointly, size_of, with_all_errors
 from workbench.gap.search.plain import (
     _at_ports,

@@ -15,8 +15,8 @@ from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, nominal_
 from workbench.gap.prediction.noise import are_coloured, noise_found
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
-from workbench.gap.search.candidates import fit_from_zero
 from workbench.gap.search.fit import cost_of, fit, sensitivity
+from workbench.gap.search.joint_starts import fit_from_zero
 from workbench.gap.search.search import Search
 from workbench.gap.search.stepwise import Stepwise
 from workbench.rig.actuators import Actuator

@@ -189,20 +189,21 @@ def attribute(
     evidence: Evidence,
     *,
     catalogue: tuple[Kind, ...],
-    report: Callable[[str, float], None],
+    progress: Callable[[str, float], None],
     uncertain_nominal: bool,
     tolerance: float,
     identified: IdentifiedPrior | None,
 ) -> Attribution:
     """Find the effects that reduce the residual of a rig on its fit records to noise.
 
-    Each kind is tried alone from many starts, then jointly with nominal errors and in pairs. A set explains the gap
-    only if the residual of every record is at its noise floor; else the outcome is "part" or "unknown".
+    The stages of `stages.STAGES` follow one another, from one effect to several beside small errors of the model. A
+    decision says "explained" where the residual is at the noise floor or a negligible share of the gap; an effect that
+    has no significant parameter then makes it "unknown".
 
     Args:
         seen, nominal, evidence: of `baseline`.
         catalogue: kinds of effects to try.
-        report: called with (what, share done) as the search proceeds.
+        progress: called with (what, share done) as the search proceeds.
         uncertain_nominal: fit nominal errors jointly with every effect from the first, for a model known to be
             inexact; otherwise only if no single effect explains the records.
         tolerance: of the signal's rms: a smaller gap above the noise is not searched for causes.
@@ -212,7 +213,7 @@ def attribute(
     of_nominal = data.by_channel(data.residual(nominal.rig))
     start = Fit(seen, cost_of(rig, (), data), data.by_channel(data.residual(rig)), 0)
     quick, first = most_informative(data, start.cost_by_channel)
-    search = Search(rig, data, quick, first, catalogue, report, workers, of_nominal, tolerance=tolerance)
+    search = Search(rig, data, quick, first, catalogue, progress, workers, of_nominal, tolerance=tolerance)
     stages = Stages(search, start, evidence, nominal, uncertain_nominal)
     outcome, best, random, rivals, noise, own_search = stages.decision()
     missing, stages = stages.missing, stages.beside_missing or stages
@@ -248,7 +249,7 @@ def attribute(
             outcome = "none" if not named else "unknown" if is_insignificant else outcome
     if noise is None:
         noise = search.noise_with(best) if random is None else search.data.noise
-    report("done", 1.0)
+    progress("done", 1.0)
     return Attribution(
         outcome=outcome,
         best=best,

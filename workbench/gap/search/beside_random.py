@@ -130,7 +130,7 @@ def _with_one_more(search: Search, best: WithRandom, evidence: Evidence) -> list
         best: effects and a random force, whose whitened residual is not white.
         evidence: of the rig with these effects.
     """
-    search.report("effects with a random disturbance", 0.2)
+    search.progress("effects with a random disturbance", 0.2)
     whitener = model_filter(evidence.model, evidence.rig, best.random)
     whitened = search.through(whitener, _observer(search, evidence.rig, best.random))
     gaining = whitened.side_by_side(simplest, _improving(search, whitened, best.given, evidence)[: RANDOM.tried])

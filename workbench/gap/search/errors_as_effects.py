@@ -16,8 +16,8 @@ from workbench.gap.effects.ports import (
     SENSOR_LAG,
 )
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
-from workbench.gap.search.candidates import TIMING, fit_from_zero
 from workbench.gap.search.fit import Fit, cost_of
+from workbench.gap.search.joint_starts import TIMING, fit_from_zero
 from workbench.gap.search.jointly import Step, evaluated, fit_jointly, is_likelier, size_of, with_all_groups
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import ERRORS, JOINT

@@ -8,9 +8,9 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import differing, figures_of
-from workbench.gap.search.candidates import fit_from_zero
 from workbench.gap.search.errors_as_effects import PORT_GROUPS
 from workbench.gap.search.fit import finite_residual
+from workbench.gap.search.joint_starts import fit_from_zero
 from workbench.gap.search.jointly import Step, too_large
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import INTERVALS, RECORDS, STEPWISE
@@ -119,7 +119,7 @@ def with_record_deviations(before: Stepwise) -> Stepwise | None:
     before.run()
     if before.decision().outcome == "explained":
         return before
-    search.report(f"{varying.figure} that varies from record to record", 0.5)
+    search.progress(f"{varying.figure} that varies from record to record", 0.5)
     varying_search = replace(search, differs=varying.figure)
     with_deviations = Stepwise(varying_search, before.ahead)
     # errors of profiles over-fit errors of single shapes
@@ -154,7 +154,7 @@ def with_mode_errors(before: Stepwise) -> Stepwise | None:
         return None
     if nearest.excess(nearest.noise_power) > STEPWISE.of_modes * float(before.search.nominal.mean()):
         return None
-    before.search.report("errors of each mode", 0.5)
+    before.search.progress("errors of each mode", 0.5)
     with_modes = Stepwise(replace(before.at_first, by_mode=True), before.ahead)
     if with_modes.is_noise_only:
         n_effects = len(with_modes.last.effects)

@@ -45,7 +45,7 @@ class Pairs:
         """The likeliest of all pairs, by a screening with no effect given."""
         pairs = cls(search)
         if not search.is_over:
-            search.report("all pairs at once", 0.4)
+            search.progress("all pairs at once", 0.4)
             pairs.explain = pairs._add_and_check(fitted_ahead(search, screened.likeliest_pairs(SELECTION.tried)))
         return pairs
 
@@ -54,7 +54,7 @@ class Pairs:
         search, found = self.search, self.found
         if not found or not search.near(found[0], PAIRS.most) or search.near(found[0], SEARCH.negligible):
             return False
-        search.report("the best pair and a third effect", 0.45)
+        search.progress("the best pair and a third effect", 0.45)
         pair = found[0].effects
         if self._explained_with_one_more(pair):
             return True
@@ -93,7 +93,7 @@ class Pairs:
         """Whether a pair with this effect explains the records."""
         if self.search.is_over:
             return False
-        self.search.report(f"{effect.kind.words} and a second effect", 0.55 + 0.05 * min(len(self.given), 8))
+        self.search.progress(f"{effect.kind.words} and a second effect", 0.55 + 0.05 * min(len(self.given), 8))
         self.given = [*self.given, effect]
         return self._add_and_check(one_more(self.search, (effect,), _evidence_with(self.search, effect)))
 

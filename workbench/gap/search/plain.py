@@ -10,7 +10,6 @@ from workbench.gap.effects.effect import Effect, contained, each_left_out, simpl
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, in_group
 from workbench.gap.effects.ports import SENSOR_DELAY
 from workbench.gap.prediction.residuals import FitData
-from workbench.gap.search.candidates import surely_late, with_reading_sides
 from workbench.gap.search.errors_as_effects import (
     DELAYS_OF_ALL,
     NO_UNIFORM_ERROR,
@@ -24,6 +23,7 @@ from workbench.gap.search.errors_as_effects import (
 from workbench.gap.search.finish import finished, other_places, ranked
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
+from workbench.gap.search.joint_starts import surely_late, with_reading_sides
 from workbench.gap.search.jointly import Step
 from workbench.gap.search.screening import Screening, on_whole_records, one_more
 from workbench.gap.search.search import Search, first_of_each, promise

@@ -37,7 +37,7 @@ class Search:
         quick: the two most informative records.
         first: the most informative record.
         catalogue: kinds of effects to try.
-        report: called with (what, share done).
+        progress: called with (what, share done).
         workers: processes that share the work.
         nominal: (n_records, n_outputs) mean square residuals of the nominal rig, in units of the noise.
         held: fixed effects that are added to every candidate.
@@ -53,7 +53,7 @@ class Search:
     quick: FitData
     first: FitData
     catalogue: tuple[Kind, ...]
-    report: Callable[[str, float], None]
+    progress: Callable[[str, float], None]
     workers: Workers
     nominal: np.ndarray
     held: tuple[Effect, ...] = ()
@@ -353,7 +353,7 @@ class Decision(NamedTuple):
 
 
 def unexplained(start: Fit, best: Fit, rivals: tuple[tuple[Fit, float], ...]) -> Decision:
-    """The verdict where no set reaches the noise floor: explained in part, or unknown.
+    """The verdict where no set reaches the noise floor: explained in part (half of the gap's rms), or unknown.
 
     Args:
         start: the fit without effects.

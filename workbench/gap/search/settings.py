@@ -293,7 +293,8 @@ class StepwiseSettings:
     # large to explain the records. Of 21 trials without an effect, the best single one left over 0.06 of the gap; of 38
     # others, one left 0.013 and was named at 0.02. A mass on a frame leaves 0.007
     almost: float = 0.01
-    in_part: float = 0.2  # likewise: largest residual of a set of effects that is named as a partial explanation
+    # likewise: largest residual of several effects that are named; the budget decides whether they explain the gap
+    in_part: float = 0.2
     # excess of the residual over the noise power that still counts as noise: a tenth of the noise by amplitude is 0.2
     no_gap: float = 0.15
     # likewise, what nominal errors alone leave without any effect: under 0.02 in 40 trials

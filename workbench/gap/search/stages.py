@@ -259,13 +259,13 @@ class Stages:
     @cached_property
     def screened(self) -> Screening:
         """All kinds of effects, screened with none given."""
-        self.search.report("one effect", 0.1)
+        self.search.progress("one effect", 0.1)
         return Screening.of(self.search, (), self.evidence)
 
     def _singles_on_whole_records(self) -> list[Fit]:
         """Single effects on whole records, best first."""
         promising = [f for f in self.ahead if f.cost < SELECTION.promising] or self.ahead[:1]
-        self.search.report("one effect, on whole records", 0.3)
+        self.search.progress("one effect, on whole records", 0.3)
         if not self.is_explained_by_none:
             return on_whole_records(self.search, promising, ATTRIBUTION.finalists)
         # only a significant gain matters, and there may be no effect at all
@@ -378,7 +378,7 @@ def _force_of_other_law(search: Search, evidence: Evidence) -> Fit | None:
 
     Two effects at one place can fit many laws, so this comes before pairs are accepted. None if there is none.
     """
-    search.report("one force of a law beyond the catalogue", 0.35)
+    search.progress("one force of a law beyond the catalogue", 0.35)
     fits = _forces_of_other_laws(search, evidence, SELECTION.promising)
     return next((f for f in (_as_catalogue_kind(search, f) for f in fits) if search.explains(f)), None)
 
@@ -409,7 +409,7 @@ def _unless_other_law(search: Search, decision: Decision, evidence: Evidence) ->
     (effect,) = best.effects
     if not effect.kind.nonlinear or effect.at is None:
         return decision
-    search.report("one force of a law beyond the catalogue", 0.9)
+    search.progress("one force of a law beyond the catalogue", 0.9)
     as_near = cost_of(search.rig, best.effects, search.ahead) + SEARCH.rival
     fits = _forces_of_other_laws(search, evidence.of_force_at(effect.at), as_near)
     other = [f for f in fits if in_catalogue(f.effects[0]) is None]

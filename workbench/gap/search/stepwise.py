@@ -10,7 +10,6 @@ from workbench.gap.effects.effect import Effect, apply_all, contained, key_of, m
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, in_group, nominal_errors
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.noise import LEAST_LOGGED
-from workbench.gap.search.candidates import TIMING, fit_from_zero, fitted_to_all, fitted_to_quick, with_reading_sides
 from workbench.gap.search.elimination import (
     backward_eliminated,
     is_as_good,
@@ -32,6 +31,7 @@ from workbench.gap.search.errors_as_effects import (
 )
 from workbench.gap.search.finish import other_places
 from workbench.gap.search.fit import Fit, cost_of, fit
+from workbench.gap.search.joint_starts import TIMING, fit_from_zero, fitted_to_all, fitted_to_quick, with_reading_sides
 from workbench.gap.search.jointly import (
     Step,
     are_plausible,
@@ -55,13 +55,13 @@ class Stepwise:
         ahead: fits of single effects to one-step-ahead predictions without nominal errors, best first; candidates for
             the first effect.
         at_first: the search without input noise.
-        steps: the sets of effects selected so far; each has one effect more or one less than the one before.
+        steps: the sets of effects selected so far, and their refits; the last one counts.
         plain: the last set without nominal errors, if it explains the records as well.
         shows_unknown_law: whether nonlinear effects cluster at one place: the catalogue lacks the law.
         tried_beside_input_noise: whether an effect has been tried with the current model of input noise, which can
             mask an effect.
         has_finer_substeps: whether the time step was refined during the selection.
-        is_run: whether `run` was called.
+        is_complete: whether no further effects are to be added.
         singles: single effects that are tried as the first; None for the likeliest by one-step-ahead prediction.
         known: fits of single effects that are not repeated.
     """
@@ -75,10 +75,10 @@ class Stepwise:
         self.at_first = self.search
         self.tried_beside_input_noise = False
         self.has_finer_substeps = False
-        self.is_run = False
+        self.is_complete = False
         self.plain: Fit | None = None
         self.shows_unknown_law = False
-        search.report("small errors of the nominal model", 0.4)
+        search.progress("small errors of the nominal model", 0.4)
         self.steps: list[Step] = []
         self.steps.append(fit_from_zero(self.search, ()))
         self._with_input_noise(self.last)
@@ -286,16 +286,16 @@ class Stepwise:
         if not search.are_noticeable(found.effects, found.fit.effects):
             return False
         self.steps.append(found)
-        self.is_run = not found.is_plausible  # errors that are large absorb the effect at any other place too
+        self.is_complete = not found.is_plausible  # errors that are large absorb the effect at any other place too
         return True
 
     # Further effects
 
     def run(self, most: int = STEPWISE.most) -> None:
         """Add effects, `most` in all, as long as each removes most of the residual power above the noise; once."""
-        if self.is_run:
+        if self.is_complete:
             return
-        self.is_run = True
+        self.is_complete = True
         if self.is_noise_only and self.last.is_plausible and not (self.last.effects or self.search.by_mode):
             self._by_shorter_description()
         first = self.last
@@ -383,7 +383,7 @@ class Stepwise:
         if len(step.effects) != 1 or not step.effects[0].kind.nonlinear or step.effects[0].at is None or step.explains:
             return None
         (effect,), search = step.effects, self.search
-        search.report("another law at the same place", 0.6)
+        search.progress("another law at the same place", 0.6)
         laws = tuple(kind for kind in search.catalogue if kind.nonlinear and kind is not effect.kind)
         with_errors = replace(search.with_nominal_errors(step.errors), catalogue=laws)
         evidence = Evidence.of(
@@ -413,7 +413,7 @@ class Stepwise:
         if len(step.effects) != 1 or not is_linear_structural(step.effects[0].kind) or step.effects[0].at is None:
             return None
         (effect,), domain = step.effects, self.search.rig.modes.domain
-        self.search.report("the same effect at other places", 0.6)
+        self.search.progress("the same effect at other places", 0.6)
         places = [(effect.moved_to(where),) for where in other_places(effect, domain)]
         here, *others = fitted_to_quick(self.search, [(effect,), *places], step)
         elsewhere = [s for s in others if apart(s.effects[0], here.effects[0], domain)]
@@ -430,7 +430,7 @@ class Stepwise:
         """
         if step.is_plausible or not step.effects or self.search.by_mode:
             return None
-        self.search.report("effects that errors of the model have absorbed", 0.6)
+        self.search.progress("effects that errors of the model have absorbed", 0.6)
         named = {effect.kind for effect in step.effects}
         singles = [f.effects for f in self._linear_singles if f.effects[0].kind not in named][: STEPWISE.finalists]
         tried = self.search.side_by_side(fit_from_zero, [(*step.effects, *each) for each in singles])
@@ -461,7 +461,7 @@ class Stepwise:
         """The likeliest sets with one more effect, fitted to the two most informative records."""
         quick, first = most_informative(self.search.data, step.fit.cost_by_channel)
         self.search = search = replace(self.search, quick=quick, first=first)
-        search.report("another effect, with small errors of the model", 0.5 + 0.1 * len(step.effects))
+        search.progress("another effect, with small errors of the model", 0.5 + 0.1 * len(step.effects))
         # the residual beyond nominal errors fitted to whole records is evidence of a missing effect
         with_errors = search.with_nominal_errors(step.errors)
         rig = apply_all(search.rig, step.fit.effects)

@@ -1,4 +1,4 @@
-"""Joint fits of candidate sets with nominal errors, from start values that lead to the global minimum."""
+"""Joint fits with nominal errors from start values that lead to the global minimum."""
 
 from collections.abc import Sequence
 from dataclasses import replace
