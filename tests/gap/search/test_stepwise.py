@@ -234,6 +234,7 @@ def test_noise_is_found_beside_resonances_and_in_colours(memory):
         (20360386, "triple", 1.0, ("axial_load", "clearance", "random_disturbance")),  # two beside a random force
         (881003, "triple", 0.5, ("actuator_dead_zone", "clearance", "ground_spring")),  # told as a cubic spring
         (94290035, "offset", 0.5, ("sensor_lag",)),  # told as a small delay
+        (20371213, "gain", 1.0, ("cubic_spring",)),  # told as a clearance, with noise of the inputs for the rest
         (94290030, "place", 2.0, ()),  # told as one sensor that is out of its place, no farther than any other
     ],
 )

@@ -153,6 +153,9 @@ class Stepwise:
         keys = {key_of(step.effects) for step in self.known}
         fresh = self.search.side_by_side(fit_from_zero, [effects for effects in sets if key_of(effects) not in keys])
         found = [s for s in (*self.known, *fresh) if not may_be_port_errors(self.search, s.effects)]
+        # one step ahead without nominal errors, the true law may come after errors of gain and place
+        another = self._with_another_law(min(found, key=lambda s: s.fit.cost)) if found else None
+        found += [] if another is None else [another]
         best = sorted(found, key=lambda s: s.fit.cost)
         if not best or (self.has_plausible_errors and not self.search.by_mode):
             return best
