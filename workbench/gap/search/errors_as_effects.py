@@ -188,8 +188,11 @@ def with_wrong_gains(search: Search, step: Step) -> Step:
         kind = {"of": ACTUATOR_GAIN, "at": SENSOR_GAIN}[side]
         if kind not in search.catalogue:
             break
-        effect = Effect(kind, port, {"gain": float(np.exp(gains[name]))})
-        found = fit_from_zero(search, (*step.effects, effect))  # other nominal errors have absorbed part of it
+        same = [effect for effect in step.effects if effect.kind is kind and effect.target == port]
+        others = [effect for effect in step.effects if effect not in same]
+        before = float(np.prod([effect.values["gain"] for effect in same]))
+        effect = Effect(kind, port, {"gain": before * float(np.exp(gains[name]))})
+        found = fit_from_zero(search, (*others, effect))  # other nominal errors have absorbed part of it
         gain = found.effects[-1].values["gain"]
         error = abs(float(np.log(gain))) if gain > 0.0 else 0.0  # a gain that passed zero: the fit has gone astray
         is_wrong = error >= max(ERRORS.most_gain, ERRORS.outlying * size_of(found.errors, "gain"))

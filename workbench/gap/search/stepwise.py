@@ -227,6 +227,8 @@ class Stepwise:
         """Whether a single effect with nominal errors explains the records; it is then the first step."""
         if not self.fitted_singles or self.search.is_over:  # the order of unfinished fits means nothing
             return False
+        if self._from_errors_of_singles() and (self.is_sufficient or not self.fitted_singles):
+            return self.is_sufficient
         best = self.fitted_singles[0]
         with_noise = None if best.explains else self._with_input_noise(best)
         if with_noise is not None:  # the residual of the nominal errors alone may be that input noise
@@ -249,6 +251,22 @@ class Stepwise:
         self.steps.append(best)
         self._with_input_noise(best)
         self.steps.append(self._with_finer_substeps(self.last))
+        return True
+
+    def _from_errors_of_singles(self) -> bool:
+        """Whether nominal errors alone are likelier from those of the best single effect; the selection restarts there.
+
+        An effect that does nothing may lead the errors out of a local minimum.
+        """
+        if self.last.effects:
+            return False
+        best = min(self.fitted_singles, key=partial(loss, self.search))
+        alone = fit_jointly(self.search, (), best.errors)
+        if not is_likelier(self.search, alone, self.last):
+            return False
+        self.steps[-1] = alone
+        self._with_input_noise(alone)
+        del self.fitted_singles  # those were fitted beside noise of the inputs that the errors left
         return True
 
     def by_few(self) -> bool:
