@@ -190,8 +190,12 @@ class Stepwise:
             if not limiting_cases & fits_as_well:
                 chosen.append(single)
         chosen = [f for f in chosen[: STEPWISE.singles] if f.cost < STEPWISE.near * chosen[0].cost]
-        # nominal errors may have absorbed an effect, so the best one without nominal errors is tried too
-        return chosen + [f for f in linear[:1] if f.key not in {other.key for other in chosen}]
+        # nominal errors may have absorbed an effect, so the best ones without nominal errors are tried too
+        alone = [f for f in self.ahead[:1] if not may_be_port_errors(search, f.effects)]
+        for single in (*linear[:1], *alone):
+            if single.effects[0].kind not in UNIFORM and single.key not in {other.key for other in chosen}:
+                chosen.append(single)
+        return chosen
 
     @property
     def _linear_singles(self) -> list[Fit]:
@@ -568,7 +572,9 @@ class Stepwise:
         found = with_wrong_gains(self.search, self.last)
         if found is self.last:
             return False
-        self.steps.append(found)
+        # a lag of all channels weakens what is quick, which a gain may stand for
+        late = with_delay_as_effect(self.search, self.last, STEPWISE.explained * self._gap)
+        self.steps.append(min(late, found, key=partial(loss, self.search)))
         return True
 
     # Input noise and substeps, with which the selection continues
