@@ -206,7 +206,8 @@ def few_with_uniform_errors(search: Search, step: Step, most: int) -> Fit | None
         if any(is_plausible_error(effect, search) for effect in named):
             return None
         if best.cost < PLAIN.near and search.explains(finished(search, best)):
-            sets = [(*s, *some) for s in (named, *each_left_out(named)) for some in _subsets(NO_UNIFORM_ERROR)]
+            fewer = (named, *each_left_out(named), *simpler_sets(named, search.rig))
+            sets = [(*s, *some) for s in fewer for some in _subsets(NO_UNIFORM_ERROR)]
             found = _simplest_explaining(search, [s for s in sets if s], step)
             return None if found is None else with_intervals(search.rig, found, search.data, search.workers)
     return None
