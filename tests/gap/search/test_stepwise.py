@@ -235,6 +235,10 @@ def test_noise_is_found_beside_resonances_and_in_colours(memory):
         (881003, "triple", 0.5, ("actuator_dead_zone", "clearance", "ground_spring")),  # told as a cubic spring
         (94290035, "offset", 0.5, ("sensor_lag",)),  # told as a small delay
         (20371213, "gain", 1.0, ("cubic_spring",)),  # told as a clearance, with noise of the inputs for the rest
+        (20371233, "input", 0.5, ("sensor_crosstalk",)),  # another pair of sensors was tried, then a gain
+        (20371244, "input", 1.0, ("sensor_gain",)),  # the gain was named twice, in two factors
+        (20371259, "mixed", 2.0, ()),  # told as damping, from a local minimum of the errors
+        (20371315, "triple", 1.0, ("actuator_gain", "sensor_drift", "support_rotation")),  # as a spring by the hinge
         (94290030, "place", 2.0, ()),  # told as one sensor that is out of its place, no farther than any other
     ],
 )
