@@ -574,7 +574,8 @@ class Stepwise:
             return False
         # a lag of all channels weakens what is quick, which a gain may stand for
         late = with_delay_as_effect(self.search, self.last, STEPWISE.explained * self._gap)
-        self.steps.append(min(late, found, key=partial(loss, self.search)))
+        is_late = late is not self.last and loss(self.search, late) < loss(self.search, found)
+        self.steps.append(late if is_late else found)
         return True
 
     # Input noise and substeps, with which the selection continues
