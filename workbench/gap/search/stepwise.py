@@ -193,7 +193,11 @@ class Stepwise:
         # nominal errors may have absorbed an effect, so the best ones without nominal errors are tried too
         alone = [f for f in self.ahead[:1] if not may_be_port_errors(search, f.effects)]
         for single in (*linear[:1], *alone):
-            if single.effects[0].kind not in UNIFORM and single.key not in {other.key for other in chosen}:
+            tried = {other.key for other in chosen}
+            if single.effects[0].kind not in UNIFORM and not tried & {
+                single.key,
+                *contained(single.effects, search.rig),
+            }:
                 chosen.append(single)
         return chosen
 
