@@ -243,7 +243,9 @@ class Stepwise:
             best = with_noise
             self.steps[-1] = fit_jointly(self.search, self.last.effects, self.last.errors)
         excess = best.excess(best.noise_power)
-        if not best.explains and excess > STEPWISE.further * float(self.search.nominal.mean()):
+        # beside errors a linear effect at a wrong place, or of a wrong kind, leaves little, but more than noise
+        is_linear = is_linear_structural(best.effects[0].kind)
+        if not best.explains and (is_linear or excess > STEPWISE.further * float(self.search.nominal.mean())):
             return False
         best = self._simplest(best, self.fitted_singles[1:], self.fitted_singles)
         # quiet noise of the inputs excites weak modes in the prediction alone, which large damping makes up for
