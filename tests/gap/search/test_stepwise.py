@@ -15,8 +15,9 @@ from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, nominal_
 from workbench.gap.prediction.noise import are_coloured, noise_found
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
-from workbench.gap.search.fit import cost_of, fit, sensitivity
+from workbench.gap.search.fit import Fit, cost_of, fit, sensitivity
 from workbench.gap.search.joint_starts import fit_from_zero
+from workbench.gap.search.jointly import evaluated
 from workbench.gap.search.search import Search
 from workbench.gap.search.stepwise import Stepwise
 from workbench.rig.actuators import Actuator
@@ -289,6 +290,17 @@ def test_sensors_are_late_as_the_records_show(rig, measured, interpolated):
     assert found.errors.target.interpolated is interpolated
     np.testing.assert_allclose(delays, late, atol=0.01)
     assert found.explains
+
+
+def test_a_set_whose_simulation_diverges_is_the_worst_and_ends_no_search(rig, measured):
+    data = FitData((measured(rig, "low", 0.3, 0),), np.full(4, NOISE))
+    nominal = data.by_channel(data.residual(rig))
+    search = Search(rig, data, data, data, CATALOGUE, lambda *_: None, ALONE, nominal)
+    softening = Effect(kind_named("cubic_spring"), None, {"at": 0.7, "stiffness": -1e12})
+    errors = nominal_errors(rig, search.prior)
+    step = evaluated(search, Fit((softening, errors), 1.0, np.ones((1, 4)), 2))
+    assert step.fit.cost == np.inf and not step.explains
+    assert step.excess(step.noise_power) == step.description(step.noise_power) == np.inf
 
 
 def test_a_comparison_that_time_cut_short_names_nothing(rig, measured):

@@ -262,8 +262,13 @@ def evaluated(search: Search, found: Fit, substeps: int | None = None) -> Step:
         step = replace(found, cost=float(by_channel.mean()), cost_by_channel=by_channel)
         return Step(step, of_noise[0], search.logged, of_noise)
     residuals = data.differences(rig)
-    with np.errstate(over="ignore", invalid="ignore"):  # the simulation may diverge
+    with np.errstate(over="ignore", invalid="ignore"):
         by_channel = np.array([((r / data.noise[:, None]) ** 2).mean(axis=1) for r in residuals])
+    if not np.isfinite(by_channel).all():  # the simulation diverged, so its residual shows no noise
+        by_channel = np.full_like(by_channel, np.inf)
+        step = replace(found, cost=np.inf, cost_by_channel=by_channel)
+        return Step(step, np.ones(data.noise.size), 0.0, np.ones_like(by_channel))
+    with np.errstate(over="ignore", invalid="ignore"):  # powers of its prewhitened residual may overflow
         coloured = are_coloured(residuals)
         credible = np.inf if is_noise_alone(residuals, data.counted, coloured) else _largest_noise_ratio(data, coloured)
         sensor_noise = np.minimum(noise_found(residuals, coloured) / data.noise, credible) ** 2
