@@ -9,18 +9,25 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.deadline import NEVER, Deadline
 from workbench.gap.effects.effect import Effect, Kind, apply_all, each_left_out, simpler_forms
-from workbench.gap.effects.nominal import IdentifiedPrior, nominal_errors
-from workbench.gap.effects.ports import SENSOR_CLIPPING, SENSOR_QUANTISATION, clipped_level, exchanged_last, step_of
+from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior, nominal_errors
+from workbench.gap.effects.ports import (
+    SENSOR_CLIPPING,
+    SENSOR_DELAY,
+    SENSOR_QUANTISATION,
+    clipped_level,
+    exchanged_last,
+    step_of,
+)
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.noise import LEAST_LOGGED, logging_noise, shows_input_noise
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import Workers
-from workbench.gap.search.errors_as_effects import uniform_as_nominal_errors
+from workbench.gap.search.errors_as_effects import may_be_small_error, uniform_as_nominal_errors, with_delay_as_error
 from workbench.gap.search.finish import widened
 from workbench.gap.search.fit import Chord, Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
-from workbench.gap.search.jointly import with_all_errors
+from workbench.gap.search.jointly import fit_jointly, with_all_errors
 from workbench.gap.search.search import Search, best_of_each, best_of_each_kind, most_informative
 from workbench.gap.search.settings import ATTRIBUTION, SELECTION
 from workbench.gap.search.stages import Stages
@@ -243,6 +250,7 @@ def attribute(
         best = _without_negligible_parameters(search, best)
         if outcome == "explained":
             best = _significant(final_search, best, seen, logged)
+            best = _without_small_errors(final_search, best, seen, logged)
             named = [e for e in best.effects if not e.kind.applied_first]
             # an effect without any significant parameter only shows that there is a gap
             is_insignificant = any(not e.stands_out(search.rig) for e in named if e not in seen)
@@ -276,25 +284,50 @@ def _refitted(search: Search, effects: Sequence[Effect], data: FitData) -> Fit:
 
 
 def _significant(search: Search, best: Fit, seen: Sequence[Effect], logged: float) -> Fit:
-    """The fit without effects that have an insignificant parameter, or with limiting cases of them.
+    """The fit without effects that have an insignificant parameter, and with limiting cases that fit as well.
 
     An effect stays if the records need it: they may determine only a combination of its parameters. A limiting case
-    is, for example, a damper for friction far below its smoothing speed.
+    is, for example, a damper for friction far below its smoothing speed, or one force of friction for two directions.
     """
     data, rig = search.data.finely(SELECTION.fine), search.rig
 
     for effect in best.effects:
-        if effect in seen or effect.kind.applied_first or (effect.stands_out(rig) and effect.is_sure(rig)):
+        if effect in seen or effect.kind.applied_first:
             continue
+        is_sure = effect.stands_out(rig) and effect.is_sure(rig)
         others = [e for e in best.effects if e is not effect and e not in seen]
+        sets = [others] * (not is_sure) + [(*others, form) for form in simpler_forms(effect, rig)]
+        if not sets:
+            continue
         here = cost_of(rig, best.effects, data)
-        sets = (others, *((*others, form) for form in simpler_forms(effect, rig)))
         simpler = [_refitted(search, each, search.data) for each in sets]
         for fewer in sorted(simpler, key=lambda f: f.n_parameters):
             if not search.tells_apart(here, fewer.cost, max(best.n_parameters - fewer.n_parameters, 0)):
                 fewer = with_intervals(rig, fewer, search.data, search.workers, logged=logged)
                 settled = _without_negligible_parameters(search, fewer).effects
                 return _significant(search, replace(fewer, effects=(*seen, *settled)), seen, logged)
+    return best
+
+
+def _without_small_errors(search: Search, best: Fit, seen: Sequence[Effect], logged: float) -> Fit:
+    """The fit without effects beside nominal errors that may be such errors themselves, if the rest explains as much.
+
+    A gain of 0.95 +- 0.01 is no sure fault where the other gains are off by 2 %.
+    """
+    errors = next((e for e in best.effects if e.kind is NOMINAL_ERRORS), None)
+    if errors is None:
+        return best
+    named = [e for e in best.effects if e not in seen and e is not errors]
+    for effect in named:
+        if not may_be_small_error(effect, errors, search):
+            continue
+        others = [e for e in named if e is not effect]
+        start = with_delay_as_error(search, errors, effect) if effect.kind is SENSOR_DELAY else errors
+        step = fit_jointly(search, others, start, until_convergence=True)
+        if step.explains:
+            fewer = with_all_errors(search, step.fit)
+            fewer = with_intervals(search.rig, fewer, search.data, search.workers, logged=logged)
+            return _without_small_errors(search, replace(fewer, effects=(*seen, *fewer.effects)), seen, logged)
     return best
 
 

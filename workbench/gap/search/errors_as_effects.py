@@ -1,19 +1,22 @@
 """The boundary between errors of a careful model and effects: effects that are as small, errors that are too large."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect, Kind
+from workbench.gap.effects.effect import Effect, Kind, place_values
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, group_of, in_group, nominal_errors
 from workbench.gap.effects.ports import (
     ACTUATOR_DELAY,
     ACTUATOR_GAIN,
     ACTUATOR_LAG,
+    ACTUATOR_MISPLACEMENT,
     SENSOR_DELAY,
     SENSOR_GAIN,
     SENSOR_LAG,
+    SENSOR_MISPLACEMENT,
 )
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.search.fit import Fit, cost_of
@@ -48,9 +51,33 @@ def is_plausible_error(effect: Effect, search: Search) -> bool:
     return is_plausible_delay(effect, search) or is_plausible_gain_or_place(effect, search.rig)
 
 
-def is_plausible_delay(effect: Effect, search: Search) -> bool:
-    """Whether an effect is a delay that a careful laboratory may have."""
-    return delay_of(effect) < dict(JOINT.widest)["delay"] * search.data.records[0].sample_time
+def may_be_small_error(effect: Effect, errors: Effect, search: Search) -> bool:
+    """Whether a fitted effect may be one of the small errors beside it: its interval reaches those of a careful model.
+
+    Args:
+        effect: with standard errors.
+        errors: nominal errors, fitted jointly. A delay is no effect unless it is longer than those among them.
+        search: of both.
+    """
+    numbers = {p.name: p.neutral for p in effect.parameters(search.rig) if p.neutral is not None}
+    reach = {name: ERRORS.wide * effect.deviations.get(name, 0.0) for name in numbers}
+    off = {name: effect.values[name] - neutral for name, neutral in numbers.items()}
+    nearer = {
+        name: neutral + np.sign(off[name]) * max(abs(off[name]) - reach[name], 0.0) for name, neutral in numbers.items()
+    }
+    smallest = replace(effect, values={**effect.values, **nearer})
+    if effect.kind in UNIFORM:
+        return bool(abs(np.log(smallest.values["factor"])) < dict(ERRORS.most_alone)[effect.kind.name])
+    if is_linear_structural(effect.kind):
+        return any(nearer[name] == neutral for name, neutral in numbers.items())
+    is_late = effect.kind is SENSOR_DELAY and is_plausible_delay(smallest, search, errors)
+    return is_late or is_plausible_error(smallest, search)
+
+
+def is_plausible_delay(effect: Effect, search: Search, errors: Effect | None = None) -> bool:
+    """Whether an effect is a delay that a careful laboratory may have, or no outlier among delays (`errors`)."""
+    among_others = 0.0 if errors is None else ERRORS.outlying * size_of(errors, "delay")
+    return delay_of(effect) < max(dict(JOINT.widest)["delay"], among_others) * search.data.records[0].sample_time
 
 
 def delay_of(effect: Effect) -> float:
@@ -163,43 +190,79 @@ def with_late_accelerometer(search: Search, step: Step, tried: Sequence[Step]) -
     """
     best = min(tried, key=lambda s: s.fit.cost)
     prior, late = step.errors.target, best.effects[-1]
-    if late.kind not in TIMING or prior.interpolated or not is_timing(search, best.effects, TIMING):
+    if late.kind not in TIMING or prior.interpolated or not is_plausible_delay(late, search, step.errors):
         return None
     accelerometers = {sensor.name for sensor in search.rig.sensors if sensor.quantity == "acceleration"}
     if late.target not in accelerometers.difference(prior.late):
         return None
-    errors = with_all_groups(search, step.errors)
-    early = tuple(name for name in prior.early if name != late.target)
-    target = replace(errors.target, late=(*prior.late, late.target), early=early)
-    delay = delay_of(late) / prior.sample_time
-    values = {**errors.values, f"delay_{late.target}": delay}
-    refitted = fit_jointly(search, step.effects, nominal_errors(search.rig, target, values))
+    refitted = fit_jointly(search, step.effects, with_delay_as_error(search, step.errors, late))
     return refitted if refitted.fit.cost < step.fit.cost else None
 
 
-def with_wrong_gains(search: Search, step: Step) -> Step:
-    """The step with gain errors too large for any calibration, and outlying among the gains, as effects."""
-    for _ in range(ERRORS.wrong_gains):
-        gains = in_group(step.errors.values, "gain")
-        name = max(gains, key=lambda n: abs(gains[n]), default="")
-        if abs(gains.get(name, 0.0)) < ERRORS.suspect * ERRORS.most_gain:
+def with_delay_as_error(search: Search, errors: Effect, late: Effect) -> Effect:
+    """The nominal errors with the delay or lag of one sensor among them; an accelerometer reads after the steps."""
+    errors = with_all_groups(search, errors)
+    prior = errors.target
+    if any(sensor.name == late.target and sensor.quantity == "acceleration" for sensor in search.rig.sensors):
+        early = tuple(name for name in prior.early if name != late.target)
+        prior = replace(prior, late=tuple(dict.fromkeys((*prior.late, late.target))), early=early)
+    values = {**errors.values, f"delay_{late.target}": delay_of(late) / prior.sample_time}
+    return nominal_errors(search.rig, prior, values)
+
+
+def with_wrong_ports(search: Search, step: Step) -> Step:
+    """The step with errors of gain and place as effects, each too large for a careful laboratory and outlying."""
+    for _ in range(ERRORS.wrong_ports):
+        suspects = sorted(_suspects(search, step), key=lambda s: -s.size)[:1]
+        if not suspects:
             break
-        _, side, port = name.split("_", 2)
-        kind = {"of": ACTUATOR_GAIN, "at": SENSOR_GAIN}[side]
-        if kind not in search.catalogue:
-            break
-        same = [effect for effect in step.effects if effect.kind is kind and effect.target == port]
-        others = [effect for effect in step.effects if effect not in same]
-        before = float(np.prod([effect.values["gain"] for effect in same]))
-        effect = Effect(kind, port, {"gain": before * float(np.exp(gains[name]))})
+        ((effect, _),) = suspects
+        others = [e for e in step.effects if (e.kind, e.target) != (effect.kind, effect.target)]
         found = fit_from_zero(search, (*others, effect))  # other nominal errors have absorbed part of it
-        gain = found.effects[-1].values["gain"]
-        error = abs(float(np.log(gain))) if gain > 0.0 else 0.0  # a gain that passed zero: the fit has gone astray
-        is_wrong = error >= max(ERRORS.most_gain, ERRORS.outlying * size_of(found.errors, "gain"))
+        group, limit = ("gain", ERRORS.most_gain) if "gain" in effect.values else ("place", ERRORS.most_moved)
+        is_wrong = _size(search.rig, found.effects[-1]) >= max(limit, ERRORS.outlying * size_of(found.errors, group))
         if not (is_wrong and search.are_noticeable(found.effects, found.fit.effects)):
             break
         step = found
     return step
+
+
+class _Suspect(NamedTuple):
+    """An effect of a port in place of its nominal error, and the size of the error over the limit of effects."""
+
+    effect: Effect
+    size: float
+
+
+def _suspects(search: Search, step: Step) -> Iterator[_Suspect]:
+    """The nominal errors of gain and place that may be effects."""
+    rig, off = search.rig, step.errors.apply(search.rig)
+    actuators, sensors = zip(rig.actuators, off.actuators, strict=True), zip(rig.sensors, off.sensors, strict=True)
+    sides = ((ACTUATOR_GAIN, ACTUATOR_MISPLACEMENT, actuators), (SENSOR_GAIN, SENSOR_MISPLACEMENT, sensors))
+    named = {(effect.kind, effect.target): effect for effect in step.effects}
+    for of_gain, of_place, ports in sides:
+        for nominal, port in ports:
+            known = named.get((of_gain, nominal.name))
+            gain = port.gain / nominal.gain
+            size = abs(float(np.log(gain))) / ERRORS.most_gain
+            if of_gain in search.catalogue and size > ERRORS.suspect:
+                gain *= 1.0 if known is None else known.values["gain"]
+                yield _Suspect(Effect(of_gain, nominal.name, {"gain": gain}), size)
+            if of_place in search.catalogue and step.errors.target.place and (of_place, nominal.name) not in named:
+                effect = Effect(of_place, nominal.name, place_values(middle(port.at)))
+                size = _size(rig, effect) / ERRORS.most_moved
+                if size > ERRORS.suspect:
+                    yield _Suspect(effect, size)
+
+
+def _size(rig: Rig, effect: Effect) -> float:
+    """Size of an error of gain (its logarithm) or of place (of the extent) of a port, as an effect."""
+    if "gain" in effect.values:
+        gain = effect.values["gain"]
+        return abs(float(np.log(gain))) if gain > 0.0 else 0.0  # a gain that passed zero: the fit has gone astray
+    ports = rig.actuators if effect.kind.path == "actuator" else rig.sensors
+    nominal = next(port.at for port in ports if port.name == effect.target)
+    return rig.modes.domain.separation(effect.at, middle(nominal))
 
 
 def with_uniform_effects(search: Search, step: Step) -> Step:

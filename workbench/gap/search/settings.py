@@ -165,8 +165,9 @@ class ErrorSettings:
     most_gain: float = 0.05
     outlying: float = 4.0
     most_moved: float = 0.01  # of the extent: an actuator or sensor that is farther off its place is an effect
-    suspect: float = 0.4  # of most_gain: gains above it are tested, since a wrong gain biases the others
-    wrong_gains: int = 2  # gains that are tested
+    suspect: float = 0.4  # of most_gain and most_moved: larger errors are tested, since one that is wrong biases others
+    wrong_ports: int = 2  # gains and places that are tested
+    wide: float = 2.0  # standard errors: an effect whose interval reaches the errors of a careful model may be one
 
 
 @dataclass(frozen=True)

@@ -27,9 +27,9 @@ from workbench.gap.search.errors_as_effects import (
     with_delay_as_effect,
     with_late_accelerometer,
     with_uniform_effects,
-    with_wrong_gains,
+    with_wrong_ports,
 )
-from workbench.gap.search.finish import other_places
+from workbench.gap.search.finish import PORTS, other_places
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.joint_starts import TIMING, fit_from_zero, fitted_to_all, fitted_to_quick, with_reading_sides
 from workbench.gap.search.jointly import (
@@ -44,7 +44,8 @@ from workbench.gap.search.jointly import (
 from workbench.gap.search.plain import few_with_uniform_errors, in_place_of_nominal_errors, other_delay_causes
 from workbench.gap.search.screening import fitted_ahead, one_more
 from workbench.gap.search.search import Decision, Search, apart, best_of_each_kind, most_informative
-from workbench.gap.search.settings import FINISH, INPUTS, PLAIN, SEARCH, STEPWISE
+from workbench.gap.search.settings import FINISH, INPUTS, PLAIN, SEARCH, SELECTION, STEPWISE
+from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
 
 
@@ -386,11 +387,14 @@ class Stepwise:
 
     def _add(self, most: int) -> None:
         """Add effects one after the other, `most` in all, and exchange a single one for a better one."""
+        is_moved = False
         while len(self.last.effects) <= most and not (self.is_sufficient and self._is_exhausted):
             if self.search.is_over:
                 break
             before = self.last
-            step = self._with_another_law(before) or self._at_another_place(before)
+            step = self._with_another_law(before)
+            moved = self._at_another_place(before) if step is None and not is_moved else None
+            step, is_moved = step or moved, moved is not None
             if step is None and len(before.effects) < most:
                 step = self._with_an_absorbed(before) or self._with_one_more(before)
             if step is None:
@@ -401,31 +405,36 @@ class Stepwise:
             if estimated and not self.search.logged:  # the input noise was none, so the choice is made again
                 self.steps[-1] = self._reselected(replace(self.last, others=step.others))
             self.steps.append(self._with_finer_substeps(backward_eliminated(self.search, self.last)))
-            if len(self.last.effects) <= len(before.effects) and not self._is_accepted(self.last, before):
+            is_same_size = len(self.last.effects) <= len(before.effects)
+            if is_same_size and not is_moved and not self._is_accepted(self.last, before):
                 break
 
     def _with_another_law(self, step: Step) -> Step | None:
         """The step with its one nonlinear law replaced by another at the same place, if that removes enough.
 
         The first effect is searched beside nominal errors that have absorbed part of it, and where those are far off, a
-        wrong law at the right place may be the best. Now that the errors are nearly known, the laws compare. More
-        general laws, of which this one is a limiting case, compete with two effects (`_with_one_more`).
+        wrong law at the right place may be the best, or air drag all along the structure for a law at a point. Now that
+        the errors are nearly known, the laws compare. More general laws, of which this one is a limiting case, compete
+        with two effects (`_with_one_more`).
         """
-        if len(step.effects) != 1 or not step.effects[0].kind.nonlinear or step.effects[0].at is None or step.explains:
+        if len(step.effects) != 1 or step.explains:
             return None
         (effect,), search = step.effects, self.search
+        if not effect.kind.nonlinear or effect.kind.path in PORTS:
+            return None
         search.progress("another law at the same place", 0.6)
         laws = tuple(kind for kind in search.catalogue if kind.nonlinear and kind is not effect.kind)
         with_errors = replace(search.with_nominal_errors(step.errors), catalogue=laws)
         evidence = Evidence.of(
             apply_all(search.rig, (step.errors,)), search.data, workers=search.workers, absorbed=True
-        ).of_force_at(effect.at)
+        )
+        evidence = evidence if effect.at is None else evidence.of_force_at(effect.at)
         key, domain = key_of(step.effects), search.rig.modes.domain
         there = [
             f
             for f in one_more(with_errors, (), evidence)
             if f.effects[0].at is not None
-            and not apart(f.effects[0], effect, domain)
+            and (effect.at is None or not apart(f.effects[0], effect, domain))
             and key not in contained(f.effects, search.rig)
         ]
         present = fitted_ahead(with_errors, [step.effects])
@@ -496,8 +505,12 @@ class Stepwise:
         # the residual beyond nominal errors fitted to whole records is evidence of a missing effect
         with_errors = search.with_nominal_errors(step.errors)
         rig = apply_all(search.rig, step.fit.effects)
-        residual = with_errors.ahead.residual(rig)
-        cost = float(residual @ residual) / residual.size
+        cost = _cost_ahead(with_errors, rig)
+        for loose in SELECTION.continuation[1:]:  # what grows slowly hides in the noise one step ahead
+            if cost > 1.0 + STEPWISE.no_gap or step.explains:
+                break
+            with_errors = replace(with_errors, loose=loose)
+            cost = _cost_ahead(with_errors, rig)
         evidence = Evidence.of(rig, search.data, workers=search.workers, absorbed=True)
         ahead = one_more(with_errors, step.effects, evidence)
         if not ahead or ahead[0].cost > (1.0 - STEPWISE.ahead) * cost:
@@ -574,8 +587,8 @@ class Stepwise:
         return found
 
     def calibrate(self) -> bool:
-        """Turn gain errors too large for any calibration into effects; True if there are any."""
-        found = with_wrong_gains(self.search, self.last)
+        """Turn errors of gain and place too large for a careful laboratory into effects; True if there are any."""
+        found = with_wrong_ports(self.search, self.last)
         if found is self.last:
             return False
         # a lag of all channels weakens what is quick, which a gain may stand for
@@ -710,6 +723,12 @@ class Stepwise:
             return []
         others = [s for s in chosen.others if key_of(s.effects) != key]
         return [chosen, *(s for s in others if s.explains or is_as_good(s, chosen, self._gap))]
+
+
+def _cost_ahead(search: Search, rig: Rig) -> float:
+    """Mean square of a rig's one-step-ahead residual, in units of the noise."""
+    residual = search.ahead.residual(rig)
+    return float(residual @ residual) / residual.size
 
 
 def _finalists(steps: Sequence[Step], cost_limit: float) -> list[Step]:
