@@ -76,6 +76,25 @@ def test_friction_far_below_its_smoothing_speed_is_a_damper():
     assert told.values["coefficient"] == pytest.approx(0.3, abs=4.0 * told.deviations["coefficient"])
 
 
+def test_friction_as_strong_in_both_directions_is_of_one_force():
+    """Both forces are sure, so no standard error shows that one is enough."""
+    nominal = identified(OMEGA)
+    friction = Effect(kind_named("coulomb_friction"), None, {"at": "y", "force": 1.0, "smoothing_speed": 0.05})
+    rng = np.random.default_rng(6)
+    clean = simulate(friction.apply(nominal), 5.0 * rng.normal(size=(1, 600)), sample_time=0.02, name="test")
+    record = replace(clean, outputs=clean.outputs + NOISE * rng.normal(size=clean.outputs.shape))
+    data = FitData((record,), np.array([NOISE]))
+    before = data.by_channel(data.residual(nominal))
+    search = Search(nominal, data, data, data, CATALOGUE, lambda text, share: None, ALONE, before)
+    values = {"at": "y", "force_forward": 1.01, "force_backward": 0.99, "smoothing_speed": 0.05}
+    two_way = Effect(kind_named("two_way_friction"), None, values)
+    found = with_intervals(nominal, fit(nominal, (two_way,), data.stepped(8)), data.stepped(8))
+    assert found.effects[0].stands_out(nominal) and found.effects[0].is_sure(nominal)
+    (told,) = _significant(search, found, (), 0.0).effects
+    assert told.kind is friction.kind
+    assert told.values["force"] == pytest.approx(1.0, abs=4.0 * told.deviations["force"])
+
+
 def test_a_joint_of_hardly_any_yield_displacement_is_a_loss_of_stiffness():
     """Its stiffness stands out and its yield displacement does not: the records do not need the latter."""
     points = NamedPoints(("S1", "S2"), positions=np.eye(2, 3), directions=("x", "x"))

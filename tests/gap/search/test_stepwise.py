@@ -240,6 +240,15 @@ def test_noise_is_found_beside_resonances_and_in_colours(memory):
         (20371244, "input", 1.0, ("sensor_gain",)),  # the gain was named twice, in two factors
         (20371259, "mixed", 2.0, ()),  # told as damping, from a local minimum of the errors
         (20371315, "triple", 1.0, ("actuator_gain", "sensor_drift", "support_rotation")),  # as a spring by the hinge
+        (20381132, "offset", 0.5, ("coulomb_friction",)),  # told as friction of two directions, of equal forces
+        (20381147, "late", 1.0, ("quadratic_damper",)),  # air drag all along the structure stood for it
+        (20381159, "gain", 2.0, ()),  # told as a gain of 0.94 +- 0.01
+        (20381161, "mixed", 2.0, ()),  # told as a stiffness off by 2.6 +- 1 %
+        (20381191, "late", 2.0, ("local_stiffness_loss",)),  # a late sensor among late ones, and a spring, beside it
+        (20381192, "gain", 2.0, ("swapped_outputs",)),  # a gain of 0.95 +- 0.01 beside it
+        (20381213, "late", 1.0, ("actuator_misplacement",)),  # errors of places and stiffness stood for it
+        (20381223, "input", 2.0, ("clearance",)),  # a loss of stiffness of 1.3 +- 0.7 % beside it
+        (20381247, "gain", 1.0, ("bouc_wen",)),  # unknown: it does not show one step ahead
         (94290030, "place", 2.0, ()),  # told as one sensor that is out of its place, no farther than any other
     ],
 )

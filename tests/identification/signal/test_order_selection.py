@@ -45,7 +45,7 @@ class Endless:
 
 
 def test_a_search_without_end_leaves_time_to_check_each_mode():
-    problem, budget = Endless(), Budget(0.3)
+    problem, budget = Endless(), Budget(1.0)
     found = Stepwise(problem, 10_000, 2, 6, forgets=False, budget=budget).select(())
     assert problem.checked > 0 and len(found) <= 1, "modes that are none are gone"
     assert "search for further modes" in budget.unfinished

@@ -88,7 +88,8 @@ def delay_of(effect: Effect) -> float:
 def is_plausible_gain_or_place(effect: Effect, rig: Rig) -> bool:
     """Whether an effect is a gain error or a shift of place within the accuracy of calibration and tape measure."""
     if "gain" in effect.values:
-        return bool(abs(np.log(abs(effect.values["gain"]))) < ERRORS.most_gain)
+        gain = effect.values["gain"]
+        return bool(gain > 0.0 and abs(np.log(gain)) < ERRORS.most_gain)
     places = [a.at for a in rig.actuators if a.name == effect.target]
     places += [s.at for s in rig.sensors if s.name == effect.target]
     if effect.at is None or not places:
