@@ -7,9 +7,9 @@ from workbench.gap.effects.effect import contained, each_left_out, key_of, merge
 from workbench.gap.search.errors_as_effects import may_be_port_errors
 from workbench.gap.search.fit import Fit, parameters_of
 from workbench.gap.search.joint_starts import fitted_to_all, fitted_to_quick
-from workbench.gap.search.jointly import Step, fit_jointly, surely_prefers
+from workbench.gap.search.jointly import Step, fit_jointly, surely_prefers, too_large
 from workbench.gap.search.search import Search, best_of_each_kind
-from workbench.gap.search.settings import SEARCH, STEPWISE
+from workbench.gap.search.settings import JOINT, SEARCH, STEPWISE
 
 
 def size_of_set(search: Search, step: Step) -> tuple[int, int]:
@@ -86,13 +86,16 @@ def limiting_case(search: Search, step: Step, gap: float) -> Step:
     return limiting_case(search, min(as_good, key=lambda s: s.fit.cost), gap) if as_good else step
 
 
-def is_as_good(step: Step, best: Step, gap: float) -> bool:
+def is_as_good(step: Step, best: Step, gap: float, *, share: float = JOINT.plausible) -> bool:
     """Whether a step with plausible nominal errors fits almost as well as the best, which does not explain the gap.
 
     Implausible nominal errors do not count: they may have absorbed an effect.
+
+    Args:
+        share: of the largest plausible errors: larger ones are implausible.
     """
     more = step.excess(best.sensor_noise) - best.excess(best.sensor_noise)
-    return step.is_plausible and not best.explains and more < SEARCH.negligible * gap
+    return not (too_large(step.errors, share=share) or best.explains) and more < SEARCH.negligible * gap
 
 
 def backward_eliminated(search: Search, step: Step) -> Step:

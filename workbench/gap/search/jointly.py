@@ -29,11 +29,9 @@ def are_plausible(errors: Effect, *, damping: bool = True) -> bool:
     return not [group for group in too_large(errors) if damping or group != "damping"]
 
 
-def too_large(errors: Effect) -> list[str]:
-    """Groups of nominal errors that are larger than in a careful laboratory."""
-    return [
-        group for group, size in _largest_plausible(errors.target) if size_of(errors, group) >= JOINT.plausible * size
-    ]
+def too_large(errors: Effect, *, share: float = JOINT.plausible) -> list[str]:
+    """Groups of nominal errors that are larger than this share of the largest plausible ones."""
+    return [group for group, size in _largest_plausible(errors.target) if size_of(errors, group) >= share * size]
 
 
 def size_of(errors: Effect, group: str) -> float:

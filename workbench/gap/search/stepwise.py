@@ -722,7 +722,8 @@ class Stepwise:
         if chosen is None:
             return []
         others = [s for s in chosen.others if key_of(s.effects) != key]
-        return [chosen, *(s for s in others if s.explains or is_as_good(s, chosen, self._gap))]
+        # a rival may have errors at the very bound of what is plausible
+        return [chosen, *(s for s in others if s.explains or is_as_good(s, chosen, self._gap, share=1.0))]
 
 
 def _cost_ahead(search: Search, rig: Rig) -> float:
