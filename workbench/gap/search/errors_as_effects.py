@@ -23,7 +23,7 @@ from workbench.gap.search.fit import Fit, cost_of
 from workbench.gap.search.joint_starts import TIMING, fit_from_zero
 from workbench.gap.search.jointly import Step, evaluated, fit_jointly, is_likelier, size_of, with_all_groups
 from workbench.gap.search.search import Search
-from workbench.gap.search.settings import ERRORS, JOINT
+from workbench.gap.search.settings import ERRORS, JOINT, STEPWISE
 from workbench.rig.rig import Rig
 from workbench.structure.domain import middle
 from workbench.structure.member import Structure
@@ -222,7 +222,8 @@ def with_wrong_ports(search: Search, step: Step) -> Step:
         found = fit_from_zero(search, (*others, effect))  # other nominal errors have absorbed part of it
         group, limit = ("gain", ERRORS.most_gain) if "gain" in effect.values else ("place", ERRORS.most_moved)
         is_wrong = _size(search.rig, found.effects[-1]) >= max(limit, ERRORS.outlying * size_of(found.errors, group))
-        if not (is_wrong and search.are_noticeable(found.effects, found.fit.effects)):
+        is_as_near = found.explains or found.fit.cost < STEPWISE.near * step.fit.cost
+        if not (is_wrong and is_as_near and search.are_noticeable(found.effects, found.fit.effects)):
             break
         step = found
     return step

@@ -588,7 +588,7 @@ class Stepwise:
 
     def calibrate(self) -> bool:
         """Turn errors of gain and place too large for a careful laboratory into effects; True if there are any."""
-        found = with_wrong_ports(self.search, self.last)
+        found = self.last if self.search.is_over else with_wrong_ports(self.search, self.last)
         if found is self.last:
             return False
         # a lag of all channels weakens what is quick, which a gain may stand for
