@@ -13,7 +13,7 @@ from workbench.identification.input_output.held_out import without_unpredictive
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import projected
 from workbench.identification.rig_from import rig_from
-from workbench.identification.signal.searches import FALSE_ALARM, Budget
+from workbench.identification.signal.searches import FALSE_ALARM, TimeLimit
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
@@ -555,7 +555,7 @@ def test_half_a_record_that_ends_before_the_inputs_act_tells_nothing():
     record = measured(system(), excitation("noise", n=100))
     data = KnownInputs([record], at_rest=False, hold="zero", feedthrough=True, delays=np.full(2, 60.0))
     fit = projected(data, POLES, np.ones((4, data.n_excitations), complex))
-    assert without_unpredictive(data, fit, np.arange(4.0), Budget()) == (fit, ())
+    assert without_unpredictive(data, fit, np.arange(4.0), TimeLimit()) == (fit, ())
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from workbench.identification.input_output import modal_fit, selection
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.model_order import Selected, SelectionOptions
 from workbench.identification.signal.modal_estimates import Identified, Refined, credible
-from workbench.identification.signal.searches import Budget
+from workbench.identification.signal.searches import TimeLimit
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes
@@ -132,7 +132,7 @@ def test_what_is_damped_too_much_to_ring_is_no_driven_mode():
     )
     data = KnownInputs([record], at_rest=True, hold="zero", feedthrough=False)
     fit = modal_fit.settled(data, modal_fit.projected(data, poles, np.ones((2, 1), complex)))
-    found, (remark,) = _without_artefacts(data, Selected(fit, np.ones(2), 1.0, False), Budget())
+    found, (remark,) = _without_artefacts(data, Selected(fit, np.ones(2), 1.0, False), TimeLimit())
     np.testing.assert_allclose(np.abs(fit.poles), omega, rtol=0.02)
     np.testing.assert_allclose(np.abs(found.fit.poles), omega[:1], rtol=1e-3)
     assert "by more than 0.3" in remark and "poles at 19" in remark
@@ -149,7 +149,7 @@ def test_the_strongest_modes_leave_time_for_the_check_of_those_that_change(monke
     monkeypatch.setattr(
         selection,
         "select_strongest",
-        lambda data, how, start: given.append(how.budget.seconds) or strongest(data, how, start),
+        lambda data, how, start: given.append(how.time_limit.seconds) or strongest(data, how, start),
     )
-    selection.select(data, SelectionOptions(4, budget=Budget(20.0)))
+    selection.select(data, SelectionOptions(4, time_limit=TimeLimit(20.0)))
     assert 5.0 < given[0] <= 10.0

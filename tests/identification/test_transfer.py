@@ -447,10 +447,10 @@ def test_a_band_that_ended_early_is_searched_in_the_time_that_others_leave(monke
 
     def ended_once(lines, options):
         first = not searched
-        searched.append((lines.omega[0], options.budget.seconds))
+        searched.append((lines.omega[0], options.time_limit.seconds))
         found = selected(lines, options)
         if first:
-            options.budget.unfinished["search for further modes"] = 0.1
+            options.time_limit.unfinished["search for further modes"] = 0.1
         return found
 
     monkeypatch.setattr(transfer, "_select_in_band", ended_once)

@@ -23,7 +23,7 @@ from workbench.identification.signal.modal_estimates import (
     time_derivatives,
 )
 from workbench.identification.signal.projection import project
-from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Budget, Progress, check_count
+from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Progress, TimeLimit, check_count
 from workbench.records.record import Channel, Record
 from workbench.renamed import Renamed, former_arguments
 from workbench.structure.modes import SampledModes, frozen
@@ -126,23 +126,23 @@ def identify_ambient(
     """
     check_count("n_modes", n_modes)
     check_outputs_move([record])
-    budget = Budget(seconds, progress)
+    time_limit = TimeLimit(seconds, progress)
     decays = _decays(record, max_lag, references)
     subspace = Subspace(_combinations(record), record.sample_time)
     stable = subspace.stable()
     # A mode has a pole, a shape and an excitation, less a scale factor, at one of n_samples frequencies.
     limit = float(chi2.isf(false_alarm / record.n_samples, 4 * subspace.n_outputs))
     if n_modes is None:
-        modes = subspace.with_errors([mode for mode in stable if mode.statistic > limit], budget)
+        modes = subspace.with_errors([mode for mode in stable if mode.statistic > limit], time_limit)
         resolution = 1.0 / (record.n_samples * record.sample_time)
         most_variance = AMBIENT.most_error**2 * resolution
         modes = [mode for mode in modes if mode.variance[1, 1] < most_variance * abs(mode.pole.real)]
     else:
-        modes = subspace.with_errors(sorted(stable, key=lambda mode: -mode.statistic)[:n_modes], budget)
+        modes = subspace.with_errors(sorted(stable, key=lambda mode: -mode.statistic)[:n_modes], time_limit)
     if not modes or len(modes) < (n_modes or 0):
         found = "no mode that rises" if n_modes is None else f"{len(modes)} stable modes, not {n_modes}, that rise"
         raise ValueError(f"record {record.name!r} holds {found} above its noise; measure longer")
-    return _report(record, sorted(modes, key=lambda mode: abs(mode.pole)), limit, decays, budget)
+    return _report(record, sorted(modes, key=lambda mode: abs(mode.pole)), limit, decays, time_limit)
 
 
 def _combinations(record: Record) -> np.ndarray:
@@ -156,7 +156,7 @@ def _combinations(record: Record) -> np.ndarray:
 
 
 def _report(
-    record: Record, poles_found: Sequence[StablePole], limit: float, decays: tuple[Record, ...], budget: Budget
+    record: Record, poles_found: Sequence[StablePole], limit: float, decays: tuple[Record, ...], time_limit: TimeLimit
 ) -> AmbientModes:
     poles = np.array([mode.pole for mode in poles_found])
     n = poles.size
@@ -166,7 +166,7 @@ def _report(
         jacobian = by_poles(poles[[r]])
         covariance[np.ix_([r, n + r], [r, n + r])] = jacobian @ mode.variance @ jacobian.T
     statistic = np.array([mode.statistic for mode in poles_found])
-    remarks = (*_uneven_level(record), *harmonic_remarks([record], poles, range(n)), *budget.remarks)
+    remarks = (*_uneven_level(record), *harmonic_remarks([record], poles, range(n)), *time_limit.remarks)
     return AmbientModes(modes, frozen(covariance), frozen(statistic), limit, decays, remarks)
 
 

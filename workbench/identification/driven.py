@@ -52,7 +52,7 @@ from workbench.identification.signal.data_quality import check_outputs_move, inp
 from workbench.identification.signal.harmonics import harmonic_remarks
 from workbench.identification.signal.modal_estimates import SURE, ParticipatingModes, credible, time_derivatives
 from workbench.identification.signal.projection import correlation, disturbed
-from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Budget, Progress, check_count
+from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Progress, TimeLimit, check_count
 from workbench.records.record import HOLDS, Channel, Record
 from workbench.renamed import Renamed, former_arguments
 from workbench.rig.statespace import signal_names
@@ -231,7 +231,7 @@ def identify_driven(
             too few samples; no mode.
     """
     check_count("max_modes", max_modes)
-    budget = Budget(seconds, progress)
+    time_limit = TimeLimit(seconds, progress)
     records = of_same_sensors(records)
     if straight is not None:
         warn('straight is now input_hold="first"; it goes with the next version', DeprecationWarning, 3)
@@ -244,7 +244,7 @@ def identify_driven(
     clipped = dict.fromkeys(fault.message for record in records for fault in input_faults(record))
     logged = records
     records, windowed = force_window(logged)
-    by_amplitude = after_impacts(records, budget)
+    by_amplitude = after_impacts(records, time_limit)
     n_samples = sum(record.n_samples for record in records)
     data = KnownInputs(
         records,
@@ -260,7 +260,7 @@ def identify_driven(
         raise ValueError(
             f"record {records[0].name!r}: {rows} samples are too few for {records[0].n_inputs} inputs; measure longer"
         )
-    options = SelectionOptions(min(max_modes, (rows - columns) // 6), false_alarm, budget)
+    options = SelectionOptions(min(max_modes, (rows - columns) // 6), false_alarm, time_limit)
     data, strongest, drift = beside_drift(data, options)
     data, selected = (select_with_delays if delays is None else select)(data, options, strongest)
     if selected.fit.poles.size == 0:
@@ -271,18 +271,18 @@ def identify_driven(
         )
     if data.clock:
         logged, records = ([on_inputs_clock(record, data.clock) for record in each] for each in (logged, records))
-    data, selected, changing = _as_time_invariant(data, selected, budget)
-    selected = only_predictive(data, selected, Budget(DRIVEN.final_seconds))
-    selected, remarks = _without_artefacts(data, selected, budget)
+    data, selected, changing = _as_time_invariant(data, selected, time_limit)
+    selected = only_predictive(data, selected, TimeLimit(DRIVEN.final_seconds))
+    selected, remarks = _without_artefacts(data, selected, time_limit)
     if delays is None:
         remarks = (*delay_remarks(data), *remarks)
-    fit = joined(data, selected.fit, budget)
+    fit = joined(data, selected.fit, time_limit)
     selected = selected.refitted(fit)
     clocks = clock_remarks(data, fit)
-    holds = hold_remarks(data, fit, selected.limit, budget)
+    holds = hold_remarks(data, fit, selected.limit, time_limit)
     bursts = burst_remarks(logged, data.left(fit), fit.noise)
     overlap = overlap_remarks(fit.poles, records[0].n_outputs * records[0].n_inputs)
-    out_of_time = budget.spent(CHANGE_CHECK)
+    out_of_time = time_limit.spent(CHANGE_CHECK)
     in_decay = by_amplitude.among(fit.poles)
     changes, explained = ((), in_decay) if out_of_time else change_remarks(data, fit, changing, in_decay)
     distorted = (*selected.distorted, *left_about(data, fit))
@@ -293,7 +293,7 @@ def identify_driven(
         records,
         data,
         selected,
-        (*clipped, *clocks, *bursts, *windowed, *drift, *holds, *remarks, *overlap, *changes, *budget.remarks),
+        (*clipped, *clocks, *bursts, *windowed, *drift, *holds, *remarks, *overlap, *changes, *time_limit.remarks),
     )
     deviation = driven.modes.omega * driven.zeta_std + 1j * driven.omega_std
     decays = by_amplitude.remarks(fit.poles, _response_sizes(data, fit), deviation)
@@ -343,7 +343,7 @@ def _checked_delays(records: Sequence[Record], delays: ArrayLike) -> np.ndarray:
 
 
 def _as_time_invariant(
-    data: KnownInputs, selected: Selected, budget: Budget
+    data: KnownInputs, selected: Selected, time_limit: TimeLimit
 ) -> tuple[KnownInputs, Selected, tuple[complex, ...]]:
     """The modes refitted as time-invariant, without the columns of changing modes, and the poles that change.
 
@@ -353,14 +353,16 @@ def _as_time_invariant(
     if not data.changing:
         return data, selected, ()
     plain, before = replace(data, beside=None, changing=()), selected.fit
-    fit = settled(plain, projected(plain, before.poles, before.participation), budget=budget)
+    fit = settled(plain, projected(plain, before.poles, before.participation), time_limit=time_limit)
     decrease = added_misfit(fit, before, before.noise)
     columns = (data.fixed.shape[1] - plain.fixed.shape[1]) * before.noise.size
     changing = data.changing if decrease > chi2.isf(FALSE_ALARM, columns) else ()
-    return *reweighted(plain, selected, fit, budget), changing
+    return *reweighted(plain, selected, fit, time_limit), changing
 
 
-def _without_artefacts(data: KnownInputs, selected: Selected, budget: Budget) -> tuple[Selected, tuple[str, ...]]:
+def _without_artefacts(
+    data: KnownInputs, selected: Selected, time_limit: TimeLimit
+) -> tuple[Selected, tuple[str, ...]]:
     """The modes refitted without poles that cannot be modes, and a remark on the poles left out."""
     out: list[float] = []
     fit = selected.fit
@@ -371,7 +373,7 @@ def _without_artefacts(data: KnownInputs, selected: Selected, budget: Budget) ->
         if good.all() or not good.any():
             break
         out += list(modes.frequencies_hz[~good])
-        fit = settled(data, only(data, fit, good), budget=budget)
+        fit = settled(data, only(data, fit, good), time_limit=time_limit)
     if not out:
         return selected, ()
     which = ", ".join(f"{f:.4g}" for f in sorted(out))

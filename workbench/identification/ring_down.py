@@ -32,7 +32,7 @@ from workbench.identification.signal.data_quality import (
 from workbench.identification.signal.harmonics import multiple_of, near_mains
 from workbench.identification.signal.modal_estimates import Identified, OfRefined, Refined
 from workbench.identification.signal.projection import forget_transforms, power_of, power_sums, project
-from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Budget, Progress
+from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Progress, TimeLimit
 from workbench.records.record import Record, as_records
 from workbench.renamed import Renamed
 from workbench.structure.modes import SampledModes
@@ -126,7 +126,7 @@ def ring_down(
         ValueError: records that differ in sensors or rate; a faulty channel; too few samples; nothing that decays
             freely.
     """
-    budget = Budget(seconds, progress)
+    time_limit = TimeLimit(seconds, progress)
     records = of_same_sensors(records)
     decays, notes = [], []
     for record in records:
@@ -139,9 +139,9 @@ def ring_down(
         )
         _check_undriven(decay)
     try:
-        identified, decays, drift_notes = _identify_with_drift(decays, n_modes, budget)
+        identified, decays, drift_notes = _identify_with_drift(decays, n_modes, time_limit)
     except np.linalg.LinAlgError:
-        identified = _by_stabilisation(decays, budget)
+        identified = _by_stabilisation(decays, time_limit)
         drift_notes = ["model order from the stabilisation diagram, because selection by likelihood failed"]
     identified = identified.without_artefacts(np.pi / decays[0].sample_time, growing=True)
     _check_decays(decays, identified.refined)
@@ -158,13 +158,13 @@ def ring_down(
         identified.noise_modes,
         identified.noise_statistic,
         identified.threshold,
-        amplitude_dependence(decays, identified.refined, budget=budget),
+        amplitude_dependence(decays, identified.refined, time_limit=time_limit),
         proportional_fit(identified.refined, sure) if len(sure) > 1 else None,
         (
             *notes,
             *drift_notes,
             *_on_given_number(mode_remarks, n_modes),
-            *budget.remarks,
+            *time_limit.remarks,
             *_undecaying(identified.refined, decays),
             *_ambient_excitation(identified.refined, mode_remarks),
             *clock_remarks(identified.refined, sure),
@@ -208,22 +208,22 @@ def _cut_to_decay(record: Record, start: float | None) -> tuple[Record, list[str
 
 
 def _identify_with_drift(
-    records: list[Record], n_modes: int | None, budget: Budget
+    records: list[Record], n_modes: int | None, time_limit: TimeLimit
 ) -> tuple[Identified, list[Record], list[str]]:
     """The modes, the records without drift, and notes; modes and drift are estimated alternately until both settle."""
     poles = np.zeros(0, complex)
     taken = _dominant_drifts(records)  # one per record once drift is removed
     span = max(record.n_samples * record.sample_time for record in records)
     for _ in range(RING_DOWN.drift_rounds):
-        identified = _identify([drift.record for drift in taken] or records, n_modes, budget)
+        identified = _identify([drift.record for drift in taken] or records, n_modes, time_limit)
         before, poles = poles, identified.modes.poles
         poles = poles[np.abs(poles) * span > 2.0 * np.pi]
         drifts = [without_drift(record, poles) for record in records]
         any_drift = any(drift.size.any() for drift in drifts)
-        if not any_drift and taken and not budget.unfinished:
+        if not any_drift and taken and not time_limit.unfinished:
             taken = []
             continue
-        if not any_drift or budget.unfinished:
+        if not any_drift or time_limit.unfinished:
             break
         # Better modes improve the estimate of an exponential settling.
         settles = any(drift.time_constant is not None for drift in drifts)
@@ -264,24 +264,24 @@ def _settles_within_a_period(drift: Drift) -> bool:
     return drift.time_constant is not None and bool(drift.time_constant * omega < 2.0 * np.pi)
 
 
-def _identify(records: list[Record], n_modes: int | None, budget: Budget) -> Identified:
+def _identify(records: list[Record], n_modes: int | None, time_limit: TimeLimit) -> Identified:
     if n_modes is None:
-        return identify_within(records, budget)
-    return _refine_given(stacked_delays(records, n_modes=n_modes), records, budget)
+        return identify_within(records, time_limit)
+    return _refine_given(stacked_delays(records, n_modes=n_modes), records, time_limit)
 
 
-def _by_stabilisation(records: list[Record], budget: Budget) -> Identified:
+def _by_stabilisation(records: list[Record], time_limit: TimeLimit) -> Identified:
     highest = max(2, min(RING_DOWN.max_modes, min(record.n_samples for record in records) // 8))
     start = stable_modes(stabilise(records, orders=range(2, highest + 1))).modes
     if start.n_modes == 0:
         name = records[0].name
         raise ValueError(f"record {name!r} holds no mode that is stable over the model order: is it a free decay?")
-    return _refine_given(start, records, budget)
+    return _refine_given(start, records, time_limit)
 
 
-def _refine_given(start: SampledModes, records: list[Record], budget: Budget) -> Identified:
+def _refine_given(start: SampledModes, records: list[Record], time_limit: TimeLimit) -> Identified:
     """The modes of `start`, refined, without any test: no mode is rejected."""
-    refined, none = in_coloured_noise(refine(records, start, offset=True, budget=budget), records), np.zeros(0)
+    refined, none = in_coloured_noise(refine(records, start, offset=True, time_limit=time_limit), records), np.zeros(0)
     return Identified(refined, none, 0.0, unshaped(none.astype(complex), records[0]), none)
 
 

@@ -32,7 +32,7 @@ from workbench.identification.signal.modal_estimates import (
     time_derivatives,
 )
 from workbench.identification.signal.projection import correlation_of_lines, disturbed, mixing_of
-from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Budget, Progress, check_count
+from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Progress, TimeLimit, check_count
 from workbench.records.record import Channel
 from workbench.renamed import Renamed, former_arguments
 from workbench.rig.sensors import MEASURED
@@ -181,15 +181,15 @@ def identify_transfer(
         ValueError: shapes that do not fit, values that are not finite, a band with too few lines, no mode.
     """
     check_count("max_modes", max_modes)
-    budget = Budget(seconds, progress)
+    time_limit = TimeLimit(seconds, progress)
     h, f, noise = _checked(transfer, frequencies_hz, channels, band_hz, noise_std)
     turned = _is_acausal(h, f)
     h = h.conj() if turned else h
-    options = SelectionOptions(max_modes, false_alarm, budget)
+    options = SelectionOptions(max_modes, false_alarm, time_limit)
     estimate, s = _in_bands(h, f, noise, channels, options), 2j * np.pi * f
     for least in (CLOCKS.phase, CLOCKS.refined):
         late = _output_delays(estimate, channels, least)
-        if not late.any() or budget.spent("search for delays of the outputs"):
+        if not late.any() or time_limit.spent("search for delays of the outputs"):
             break
         delays = estimate.delays + late
         estimate = _in_bands(h * np.exp(s * delays[:, None, None]), f, noise, channels, options)
@@ -212,7 +212,7 @@ def identify_transfer(
     )
     estimate = replace(
         estimate,
-        remarks=(*checks, *estimate.remarks, *overlap, *_scatter_remark(estimate), *overtones, *budget.remarks),
+        remarks=(*checks, *estimate.remarks, *overlap, *_scatter_remark(estimate), *overtones, *time_limit.remarks),
         fitted=frozen(estimate.fitted.conj() if turned else estimate.fitted, complex),
     )
     if estimate.modes.n_modes == 0:
@@ -236,7 +236,7 @@ def _in_bands(
     )
     share = f.size / n_bands
 
-    def band(k: int, band_budget: Budget) -> TransferModes:
+    def band(k: int, band_budget: TimeLimit) -> TransferModes:
         first, last = round(k * share), round((k + 1) * share)
         inside = slice(max(first - TRANSFER.overlap_lines, 0), last + TRANSFER.overlap_lines)
         edges = f[first] if k else 0.0, f[last] if last < f.size else np.inf
@@ -250,17 +250,17 @@ def _in_bands(
         selected = _select_in_band(lines, SelectionOptions(most, options.false_alarm / n_bands, band_budget))
         return _modes_of(*selected, channels, edges, f[first:last])
 
-    budget, budgets, results = options.budget, [], []
+    time_limit, budgets, results = options.time_limit, [], []
     for k in range(n_bands):
-        budgets.append(budget.apart(1.0 / (n_bands - k)))
+        budgets.append(time_limit.apart(1.0 / (n_bands - k)))
         results.append(band(k, budgets[k]))
     # A band of modes that change takes many times its share of the time; other bands hardly use theirs.
     ended = [k for k in range(n_bands) if budgets[k].unfinished]
     for remaining, k in zip(range(len(ended), 0, -1), ended, strict=True):
-        again = budget.apart(1.0 / remaining)
+        again = time_limit.apart(1.0 / remaining)
         if (again.seconds or 0.0) > (budgets[k].seconds or 0.0):
             results[k], budgets[k] = band(k, again), again
-        budget.counted(budgets[k])
+        time_limit.counted(budgets[k])
     return _joined(results, channels) if n_bands > 1 else results[0]
 
 
@@ -286,7 +286,7 @@ def _select_in_band(lines: Lines, options: SelectionOptions) -> tuple[Lines, Sel
     """The lines of a band with weights, and their modes; noise not stated is estimated from the strongest modes."""
     if lines.noise is not None:
         return _select_with_changing(lines, options)
-    h, budget = lines.h, options.budget
+    h, time_limit = lines.h, options.time_limit
     few = replace(options, max_modes=min(TRANSFER.strongest, options.max_modes))
     selected = select_modes(lines, few)
     guessed = relative_noise(lines, selected.fit)
@@ -309,11 +309,11 @@ def _select_in_band(lines: Lines, options: SelectionOptions) -> tuple[Lines, Sel
         *_select_with_changing(replace(lines, h=mixed, noise=None, guessed=False), few), options
     )
     lines = replace(uncorrelated, h=h, noise=None, guessed=False)
-    fit = settled(lines, projected(lines, selected.fit.poles, selected.fit.participation), budget=budget)
+    fit = settled(lines, projected(lines, selected.fit.poles, selected.fit.participation), time_limit=time_limit)
     guessed = relative_noise(lines, fit)
     if guessed is not None:
         lines = replace(lines, noise=guessed, guessed=True)
-        fit = settled(lines, projected(lines, fit.poles, fit.participation), budget=budget)
+        fit = settled(lines, projected(lines, fit.poles, fit.participation), time_limit=time_limit)
     return lines, selected.refitted(fit)
 
 
@@ -322,7 +322,7 @@ def _select_with_changing(
 ) -> tuple[Lines, Selected]:
     """The lines with columns for the motion of modes that change, and the modes, one for each that changes."""
     selected = select_modes(lines, options) if selected is None else selected
-    while (change := beside_changing(lines, selected.fit, selected.limit, options.budget)) is not None:
+    while (change := beside_changing(lines, selected.fit, selected.limit, options.time_limit)) is not None:
         lines, start = change
         selected = select_modes(lines, options, start)
     return lines, selected
@@ -330,7 +330,7 @@ def _select_with_changing(
 
 def _select_weighted(lines: Lines, selected: Selected, options: SelectionOptions) -> tuple[Lines, Selected]:
     """The lines and their modes, with alternating estimates of noise and modes, for outputs of uncorrelated noise."""
-    budget = options.budget
+    time_limit = options.time_limit
     before: np.ndarray | None = None
     for _ in range(TRANSFER.noise_rounds):
         guessed = relative_noise(lines, selected.fit)
@@ -338,14 +338,14 @@ def _select_weighted(lines: Lines, selected: Selected, options: SelectionOptions
             before is not None and np.log(guessed / before).std(axis=(1, 2)).max() < TRANSFER.alike  # up to a factor
         ):
             break
-        if budget.spent("estimation of the noise"):
+        if time_limit.spent("estimation of the noise"):
             return lines, selected
         before = guessed
         weighted = replace(lines, noise=guessed, guessed=True, beside=None, changing=())
         # The selection starts from the modes found: with noise proportional to the response, lines between modes have
         # the largest weights, and the least information.
         weighted, reselected = _select_with_changing(weighted, options, select_modes(weighted, options, selected.fit))
-        if budget.spent("estimation of the noise") and reselected.fit.poles.size < selected.fit.poles.size:
+        if time_limit.spent("estimation of the noise") and reselected.fit.poles.size < selected.fit.poles.size:
             return lines, selected
         lines, selected = weighted, reselected
     return (lines, selected) if lines.guessed else _select_with_changing(lines, options)

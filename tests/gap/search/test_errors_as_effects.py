@@ -13,7 +13,7 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.search.errors_as_effects import _suspects, may_be_small_error
 from workbench.gap.search.fit import Fit
-from workbench.gap.search.jointly import Step
+from workbench.gap.search.jointly import JointFit
 from workbench.gap.search.search import Search
 from workbench.rig.simulate import simulate
 
@@ -69,7 +69,7 @@ def test_the_port_that_errors_move_and_scale_is_suspected(search):
     errors = nominal_errors(search.rig, NominalPrior(place=0.01, gain=0.01, sample_time=SAMPLE_TIME))
     assert set(values) <= set(errors.values)
     errors = replace(errors, values={**errors.values, **values})
-    step = Step(Fit((errors,), 1.0, np.ones((1, 4)), 0), np.ones(4), 0.0, np.ones((1, 4)))
+    step = JointFit(Fit((errors,), 1.0, np.ones((1, 4)), 0), np.ones(4), 0.0, np.ones((1, 4)))
     found = {(s.effect.kind.name, s.effect.target): s.effect for s in _suspects(search, step)}
     assert set(found) == {("actuator_misplacement", "F2"), ("sensor_gain", "d1")}
     assert found["actuator_misplacement", "F2"].at == pytest.approx(1.24)

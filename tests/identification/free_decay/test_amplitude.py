@@ -5,7 +5,7 @@ from scipy.integrate import solve_ivp
 from workbench.identification.free_decay.assumptions import amplitude_dependence
 from workbench.identification.free_decay.ibrahim import stacked_delays
 from workbench.identification.free_decay.refinement import refine
-from workbench.identification.signal.searches import Budget
+from workbench.identification.signal.searches import TimeLimit
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes
@@ -49,10 +49,10 @@ def test_one_stretch_compares_nothing():
 def test_the_comparison_ends_with_the_time():
     truth = SampledModes([9.0], [0.01], [[1.0]], [0.0])
     record = free_decay(truth, sample_time=0.02, n_samples=900, noise_std=0.003)
-    budget = Budget(1e-6)
-    found = amplitude_dependence(record, refine(record, truth), budget=budget)
+    time_limit = TimeLimit(1e-6)
+    found = amplitude_dependence(record, refine(record, truth), time_limit=time_limit)
     assert np.isnan(found.omega).all() and not found.depends.any()
-    assert "comparison of modes by amplitude" in budget.remarks[0]
+    assert "comparison of modes by amplitude" in time_limit.remarks[0]
 
 
 def test_a_pole_that_wanders_off_gives_no_mode_the_figures_of_another():

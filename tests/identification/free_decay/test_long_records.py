@@ -8,7 +8,7 @@ from workbench.identification.free_decay import order
 from workbench.identification.free_decay.long_records import identify_long
 from workbench.identification.free_decay.order import identify
 from workbench.identification.free_decay.refinement import cramer_rao_bound
-from workbench.identification.signal.searches import Budget
+from workbench.identification.signal.searches import TimeLimit
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes
@@ -111,7 +111,7 @@ def test_a_mode_at_half_the_sample_rate_keeps_no_other_from_being_fitted():
 
 def test_the_first_modes_are_worth_the_wait(truth, record):
     """They were said not to be there where the time had gone before the search began."""
-    found = identify_long([record], max_modes=99, budget=Budget(1e-9))
+    found = identify_long([record], max_modes=99, time_limit=TimeLimit(1e-9))
     assert found is not None and found.remarks
     strongest = [0, 1, 3, 5, 6]
     assert all(np.abs(found.modes.omega / omega - 1.0).min() < 0.01 for omega in truth.omega[strongest][:2])

@@ -5,7 +5,7 @@ import pytest
 
 from workbench.identification.free_decay.order import _FreeDecay, _Grid, identify
 from workbench.identification.free_decay.refinement import cramer_rao_bound, in_coloured_noise, refine
-from workbench.identification.signal.searches import Budget
+from workbench.identification.signal.searches import TimeLimit
 from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.records.record import Channel, Record
 from workbench.structure.damping import ProportionalDamping
@@ -153,7 +153,7 @@ def search_of(poles, amplitudes):
     outputs = (np.array(amplitudes) @ np.exp(np.outer(poles, time))).real
     outputs = outputs + 0.01 * np.random.default_rng(0).standard_normal(time.size)
     record = Record(0.02, outputs[None], (Channel("a", "velocity"),))
-    problem = _FreeDecay([record], 0.001, [record], Budget(), [])
+    problem = _FreeDecay([record], 0.001, [record], TimeLimit(), [])
     return problem, lambda *which: problem.settled(replace(problem.nothing, poles=np.array(poles)[list(which)]))
 
 

@@ -5,7 +5,7 @@ import numpy as np
 from workbench.identification.input_output.changing_decay import beside_changing
 from workbench.identification.input_output.model_order import SelectionOptions, select_modes
 from workbench.identification.input_output.spectral_lines import Lines
-from workbench.identification.signal.searches import Budget
+from workbench.identification.signal.searches import TimeLimit
 
 
 def test_a_rate_of_third_degree_in_time_is_one_mode():
@@ -19,7 +19,7 @@ def test_a_rate_of_third_degree_in_time_is_one_mode():
     lines = Lines(h[None, None], 2.0 * np.pi * f[about], [0, -2], None)
     linear = select_modes(lines, SelectionOptions(3)).fit
     assert linear.poles.size == 3
-    changing, one = beside_changing(lines, linear, 0.0, Budget())
+    changing, one = beside_changing(lines, linear, 0.0, TimeLimit())
     assert one.poles.size == 1
     # 7.2 t² - 3.84 t³, weighted by the power e^-4t, whose moments are E t^k = k! / 4^k
     true = np.sqrt(

@@ -8,7 +8,7 @@ from workbench.identification.input_output import changing_response, time_varian
 from workbench.identification.input_output.changing_response import _simulated
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import projected
-from workbench.identification.signal.searches import Budget
+from workbench.identification.signal.searches import TimeLimit
 from workbench.records.record import Channel, Record
 
 
@@ -130,5 +130,5 @@ def test_modes_far_apart_are_not_compared_with_a_changing_one(monkeypatch, apart
     fit = projected(data, (-0.05 + 1j) * omega, np.ones((2, 1), complex))
     tried: list[np.ndarray] = []
     monkeypatch.setattr(time_variance, "in_place_of", lambda data, fit, cluster, *options: tried.append(cluster))
-    assert time_variance.beside_changing(data, fit, 20.0, Budget(), []) is None
+    assert time_variance.beside_changing(data, fit, 20.0, TimeLimit(), []) is None
     assert bool(tried) == compared

@@ -10,7 +10,7 @@ from workbench.identification.driven import identify_driven
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import projected, settled
 from workbench.identification.input_output.output_clock import on_one_clock, output_clock
-from workbench.identification.signal.searches import Budget
+from workbench.identification.signal.searches import TimeLimit
 from workbench.records.band_limited import derivative_of, spaced
 from workbench.records.record import Channel, Record
 
@@ -65,7 +65,7 @@ def test_frequencies_that_fall_are_no_clock(falling):
     fit = settled(data, projected(data, poles, np.tile([1.0 + 0j, 0.0], (3, 1))))
     clock = output_clock(data, fit)
     assert abs(clock.rate) < 4.0 * clock.std < 2e-5
-    assert on_one_clock(data, fit, None, Budget()) is None
+    assert on_one_clock(data, fit, None, TimeLimit()) is None
 
 
 def test_frequencies_that_fall_beside_another_clock():

@@ -4,7 +4,7 @@ from scipy.signal import lfilter
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import MANY_ROWS, projected
 from workbench.identification.input_output.rivals import in_place_of_clusters, orthonormal_basis
-from workbench.identification.signal.searches import Budget
+from workbench.identification.signal.searches import TimeLimit
 from workbench.records.record import Channel, Record
 
 
@@ -38,7 +38,7 @@ def test_what_follows_a_changing_mode_is_compared_beside_it():
         return (beside, poles[cluster[0]] + 1.0) if cluster.size == 2 and 0 in cluster else None
 
     alike = np.abs(np.subtract.outer(hz, hz)) < 5.0
-    found = in_place_of_clusters(data, fit, alike, rival_of, Budget())
+    found = in_place_of_clusters(data, fit, alike, rival_of, TimeLimit())
     assert found is not None and found[0] is beside
     strongest_pair = compared[1][1]
     kept = np.delete(np.arange(5), [m for m in strongest_pair if m != 0])

@@ -4,7 +4,7 @@ difficulty)."""
 import numpy as np
 import pytest
 
-from workbench.identification.signal.searches import Budget, minimise
+from workbench.identification.signal.searches import TimeLimit, minimise
 
 Y = [10.07, 14.73, 17.94, 23.93, 29.61, 35.18, 40.02, 44.82, 50.76, 55.05, 61.01, 66.40, 75.47, 81.78]
 X = [77.6, 114.9, 141.1, 190.8, 239.9, 289.0, 332.8, 378.4, 434.8, 477.3, 536.8, 593.1, 689.1, 760.0]
@@ -49,10 +49,10 @@ def test_units_do_not_matter():
 
 
 def test_time_that_is_up_ends_the_search_and_is_noted():
-    budget = Budget(1e-9)
-    found = minimise(Misra(), np.array([500.0, 1e-4]), most_steps=100, budget=budget)
+    time_limit = TimeLimit(1e-9)
+    found = minimise(Misra(), np.array([500.0, 1e-4]), most_steps=100, time_limit=time_limit)
     assert found.steps == 1 and not found.converged and found.cost < Misra().cost((500.0, 1e-4))
-    assert [*budget.unfinished] == ["refinement"] and "allow more time" in budget.remarks[0]
+    assert [*time_limit.unfinished] == ["refinement"] and "allow more time" in time_limit.remarks[0]
 
 
 def test_a_search_that_is_in_vain_ends():

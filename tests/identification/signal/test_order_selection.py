@@ -1,8 +1,8 @@
-"""Stepwise selection on a problem that has no end: what was taken in is checked all the same."""
+"""OrderSelection selection on a problem that has no end: what was taken in is checked all the same."""
 
 from time import thread_time
 
-from workbench.identification.signal.searches import Budget, Stepwise
+from workbench.identification.signal.searches import OrderSelection, TimeLimit
 
 
 class Endless:
@@ -45,10 +45,10 @@ class Endless:
 
 
 def test_a_search_without_end_leaves_time_to_check_each_mode():
-    problem, budget = Endless(), Budget(1.0)
-    found = Stepwise(problem, 10_000, 2, 6, forgets=False, budget=budget).select(())
+    problem, time_limit = Endless(), TimeLimit(1.0)
+    found = OrderSelection(problem, 10_000, 2, 6, forgets=False, time_limit=time_limit).select(())
     assert problem.checked > 0 and len(found) <= 1, "modes that are none are gone"
-    assert "search for further modes" in budget.unfinished
+    assert "search for further modes" in time_limit.unfinished
 
 
 class Slow(Endless):
@@ -62,18 +62,18 @@ class Slow(Endless):
 
 
 def test_the_search_goes_on_in_the_time_that_the_check_of_each_mode_leaves():
-    budget = Budget(0.18)  # of which the search has six tenths before the first check
-    found = Stepwise(Slow(), 10_000, 2, 6, forgets=False, budget=budget, alone=True).select(())
-    assert len(found) == 12 and not budget.remarks
+    time_limit = TimeLimit(0.18)  # of which the search has six tenths before the first check
+    found = OrderSelection(Slow(), 10_000, 2, 6, forgets=False, time_limit=time_limit, alone=True).select(())
+    assert len(found) == 12 and not time_limit.remarks
 
 
 def test_what_was_ended_early_says_when():
     """A part that half of the time was for ends at half of it, not when all is spent."""
-    budget = Budget(0.1)
-    part = budget.share(0.5)
+    time_limit = TimeLimit(0.1)
+    part = time_limit.share(0.5)
     until = thread_time() + 0.06
     while not part.spent("search"):
         assert thread_time() < until
-    (remark,) = budget.remarks
+    (remark,) = time_limit.remarks
     seconds = float(remark.split()[2])
     assert 0.05 <= seconds < 0.09 and "of the 0.1 s allowed, unfinished: search (ended at 50 % of it);" in remark

@@ -15,7 +15,7 @@ from workbench.gap.prediction.innovations import Observer
 from workbench.gap.prediction.random_force import TONAL, RandomForceFit, fit_random_force, followed, model_filter, tonal
 from workbench.gap.search.finish import finished, plainest, ranked, simplest
 from workbench.gap.search.fit import Fit, cost_of, fit, parameters_of
-from workbench.gap.search.jointly import Step, fit_jointly
+from workbench.gap.search.jointly import JointFit, fit_jointly
 from workbench.gap.search.screening import on_whole_records, one_more
 from workbench.gap.search.search import Decision, Search, best_of_each_kind
 from workbench.gap.search.settings import INTERVALS, RANDOM, SEARCH, STEPWISE
@@ -140,7 +140,7 @@ def _with_one_more(search: Search, best: WithRandom, evidence: Evidence) -> list
     return sorted(found, key=lambda each: each.random.cost, reverse=True)
 
 
-def random_with_nominal_errors(search: Search, step: Step, *, surely: bool = True) -> Decision | None:
+def random_with_nominal_errors(search: Search, step: JointFit, *, surely: bool = True) -> Decision | None:
     """The decision for a random disturbance with nominal errors and effects; None if none holds.
 
     The nominal errors and the whitening filter of the force are fitted in turns. Since no model is exact, the residual

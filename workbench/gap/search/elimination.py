@@ -7,17 +7,19 @@ from workbench.gap.effects.effect import contained, each_left_out, key_of, merge
 from workbench.gap.search.errors_as_effects import may_be_port_errors
 from workbench.gap.search.fit import Fit, parameters_of
 from workbench.gap.search.joint_starts import fitted_to_all, fitted_to_quick
-from workbench.gap.search.jointly import Step, fit_jointly, surely_prefers, too_large
+from workbench.gap.search.jointly import JointFit, fit_jointly, surely_prefers, too_large
 from workbench.gap.search.search import Search, best_of_each_kind
 from workbench.gap.search.settings import JOINT, SEARCH, STEPWISE
 
 
-def size_of_set(search: Search, step: Step) -> tuple[int, int]:
+def size_of_set(search: Search, step: JointFit) -> tuple[int, int]:
     """Number of parameters and of effects: of as many parameters, one effect is simpler than two."""
     return len(parameters_of(search.rig, step.effects)), len(step.effects)
 
 
-def simplest_step(search: Search, best: Step, tried: Sequence[Step], ahead: Sequence[Fit], gap: float) -> Step:
+def simplest_step(
+    search: Search, best: JointFit, tried: Sequence[JointFit], ahead: Sequence[Fit], gap: float
+) -> JointFit:
     """The best step, or a simpler set (a limiting case, or fewer effects) that fits almost as well.
 
     Args:
@@ -51,7 +53,7 @@ def simplest_step(search: Search, best: Step, tried: Sequence[Step], ahead: Sequ
     return min(fewer, key=lambda s: (size(s), s.fit.cost)) if fewer else best
 
 
-def _refitted_to_all(search: Search, on_quick: Sequence[Step], best: Step, gap: float) -> Sequence[Step]:
+def _refitted_to_all(search: Search, on_quick: Sequence[JointFit], best: JointFit, gap: float) -> Sequence[JointFit]:
     """The steps; those that may be as good as `best`, which was fitted to all records, are refitted to all."""
     if not best.explains:
         return on_quick
@@ -61,7 +63,7 @@ def _refitted_to_all(search: Search, on_quick: Sequence[Step], best: Step, gap: 
     )
 
 
-def _simpler_singles(search: Search, best: Step, ahead: Sequence[Fit]) -> list[Step]:
+def _simpler_singles(search: Search, best: JointFit, ahead: Sequence[Fit]) -> list[JointFit]:
     """Single effects of fewer parameters that fit almost as well as a single effect, fitted to all records."""
     if len(best.effects) != 1 or not ahead:
         return []
@@ -74,7 +76,7 @@ def _simpler_singles(search: Search, best: Step, ahead: Sequence[Fit]) -> list[S
     return [step for step in fitted if not may_be_port_errors(search, step.effects)]
 
 
-def limiting_case(search: Search, step: Step, gap: float) -> Step:
+def limiting_case(search: Search, step: JointFit, gap: float) -> JointFit:
     """The step with effects replaced by limiting cases that fit as well, if no set explains the records.
 
     Any law fits some of the residual of a measured gap, so a slightly smaller residual justifies no wider law.
@@ -86,7 +88,7 @@ def limiting_case(search: Search, step: Step, gap: float) -> Step:
     return limiting_case(search, min(as_good, key=lambda s: s.fit.cost), gap) if as_good else step
 
 
-def is_as_good(step: Step, best: Step, gap: float, *, share: float = JOINT.plausible) -> bool:
+def is_as_good(step: JointFit, best: JointFit, gap: float, *, share: float = JOINT.plausible) -> bool:
     """Whether a step with plausible nominal errors fits almost as well as the best, which does not explain the gap.
 
     Implausible nominal errors do not count: they may have absorbed an effect.
@@ -98,7 +100,7 @@ def is_as_good(step: Step, best: Step, gap: float, *, share: float = JOINT.plaus
     return not (too_large(step.errors, share=share) or best.explains) and more < SEARCH.negligible * gap
 
 
-def backward_eliminated(search: Search, step: Step) -> Step:
+def backward_eliminated(search: Search, step: JointFit) -> JointFit:
     """The step after backward elimination: without effects that later ones have made unnecessary."""
     fewer = fitted_to_quick(search, list(each_left_out(step.effects)), step) if step.effects else []
     if not fewer:  # no effect can act without the others
@@ -109,7 +111,7 @@ def backward_eliminated(search: Search, step: Step) -> Step:
     return backward_eliminated(search, best) if is_needless else step
 
 
-def without_inactive(search: Search, step: Step) -> Step:
+def without_inactive(search: Search, step: JointFit) -> JointFit:
     """The step without effects that no longer alter the readings, because another has replaced them."""
     kept = search.noticeable(step.effects, step.fit.effects)
     if len(kept) in (0, len(step.effects)):

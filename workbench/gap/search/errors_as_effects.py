@@ -21,7 +21,7 @@ from workbench.gap.effects.ports import (
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.search.fit import Fit, cost_of
 from workbench.gap.search.joint_starts import TIMING, fit_from_zero
-from workbench.gap.search.jointly import Step, evaluated, fit_jointly, is_likelier, size_of, with_all_groups
+from workbench.gap.search.jointly import JointFit, evaluated, fit_jointly, is_likelier, size_of, with_all_groups
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import ERRORS, JOINT, STEPWISE
 from workbench.rig.rig import Rig
@@ -184,7 +184,7 @@ def with_common_delay(found: Fit) -> Fit:
     return replace(found, effects=(*others, late, replace(errors, values={**errors.values, **rest})))
 
 
-def with_late_accelerometer(search: Search, step: Step, tried: Sequence[Step]) -> Step | None:
+def with_late_accelerometer(search: Search, step: JointFit, tried: Sequence[JointFit]) -> JointFit | None:
     """The step with an accelerometer that reads before the input steps, if the best candidate delays it.
 
     The acceleration jumps with a held input, so the cost jumps at zero delay and no gradient leads across.
@@ -211,7 +211,7 @@ def with_delay_as_error(search: Search, errors: Effect, late: Effect) -> Effect:
     return nominal_errors(search.rig, prior, values)
 
 
-def with_wrong_ports(search: Search, step: Step) -> Step:
+def with_wrong_ports(search: Search, step: JointFit) -> JointFit:
     """The step with errors of gain and place as effects, each too large for a careful laboratory and outlying."""
     for _ in range(ERRORS.wrong_ports):
         suspects = sorted(_suspects(search, step), key=lambda s: -s.size)[:1]
@@ -236,7 +236,7 @@ class _Suspect(NamedTuple):
     size: float
 
 
-def _suspects(search: Search, step: Step) -> Iterator[_Suspect]:
+def _suspects(search: Search, step: JointFit) -> Iterator[_Suspect]:
     """The nominal errors of gain and place that may be effects."""
     rig, off = search.rig, step.errors.apply(search.rig)
     actuators, sensors = zip(rig.actuators, off.actuators, strict=True), zip(rig.sensors, off.sensors, strict=True)
@@ -267,7 +267,7 @@ def _size(rig: Rig, effect: Effect) -> float:
     return rig.modes.domain.separation(effect.at, middle(nominal))
 
 
-def with_uniform_effects(search: Search, step: Step) -> Step:
+def with_uniform_effects(search: Search, step: JointFit) -> JointFit:
     """The step with uniform stiffness and damping errors as effects, if too large for nominal errors."""
     values, dampings = step.errors.values, in_group(step.errors.values, "damping")
     damping = float(np.mean([*dampings.values()] or [0.0]))
@@ -285,7 +285,7 @@ def with_uniform_effects(search: Search, step: Step) -> Step:
     return fit_jointly(search, (*step.effects, *added), replace(step.errors, values=reset), rounds=2)
 
 
-def with_delay_as_effect(search: Search, step: Step, least: float) -> Step:
+def with_delay_as_effect(search: Search, step: JointFit, least: float) -> JointFit:
     """The step with sensor delays of one common cause as that effect, if it fits as well.
 
     Args:

@@ -10,14 +10,14 @@ from workbench.gap.effects.effect import Effect, apply_all, can_be, from_other_s
 from workbench.gap.effects.nominal import JUST_LATE, in_group, nominal_errors
 from workbench.gap.effects.ports import SENSOR_DELAY, SENSOR_LAG
 from workbench.gap.search.fit import Chord, Fit, fit, slopes
-from workbench.gap.search.jointly import Step, fit_jointly, loss
+from workbench.gap.search.jointly import JointFit, fit_jointly, loss
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import JOINT, STEPWISE
 
 TIMING = (SENSOR_DELAY, SENSOR_LAG)  # kinds that delay the readings of a sensor
 
 
-def fitted_to_quick(search: Search, sets: Sequence[tuple[Effect, ...]], step: Step) -> list[Step]:
+def fitted_to_quick(search: Search, sets: Sequence[tuple[Effect, ...]], step: JointFit) -> list[JointFit]:
     """The physically possible ones of some sets, fitted to the two most informative records.
 
     The nominal errors start as those of a step, with the sensitivities to them.
@@ -31,7 +31,7 @@ def fitted_to_quick(search: Search, sets: Sequence[tuple[Effect, ...]], step: St
     )
 
 
-def fitted_to_all(search: Search, step: Step) -> Step:
+def fitted_to_all(search: Search, step: JointFit) -> JointFit:
     """The effects of a step fitted to all records.
 
     Nominal errors fitted without an effect have absorbed part of it and may be in another local minimum, so they start
@@ -43,13 +43,13 @@ def fitted_to_all(search: Search, step: Step) -> Step:
     return min(fresh, fit_jointly(search, step.effects, step.errors, rounds=2), key=lambda s: s.fit.cost)
 
 
-def fit_from_zero(search: Search, effects: Sequence[Effect]) -> Step:
+def fit_from_zero(search: Search, effects: Sequence[Effect]) -> JointFit:
     """The effects and nominal errors that start from zero, fitted jointly to all records; the best of other starts."""
     sets = (effects, *from_other_starts(effects, search.rig))
     return min((_fitted_from_zero(search, each) for each in sets), key=partial(loss, search))
 
 
-def _fitted_from_zero(search: Search, effects: Sequence[Effect]) -> Step:
+def _fitted_from_zero(search: Search, effects: Sequence[Effect]) -> JointFit:
     """The effects from their start values, with nominal errors from zero.
 
     With wrong frequencies, a simulation drifts out of phase over a record, so one-step-ahead predictions are fitted

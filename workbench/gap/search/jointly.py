@@ -46,7 +46,7 @@ def _largest_plausible(prior: NominalPrior) -> list[tuple[str, float]]:
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class JointFit:
     """A set of effects fitted jointly with nominal errors.
 
     Attributes:
@@ -61,7 +61,7 @@ class Step:
     sensor_noise: np.ndarray
     logged: float
     noise_power: np.ndarray
-    others: "tuple[Step, ...]" = ()
+    others: "tuple[JointFit, ...]" = ()
 
     @property
     def effects(self) -> tuple[Effect, ...]:
@@ -101,7 +101,7 @@ class Step:
         return float(np.maximum(self.fit.cost_by_channel - noise_power, 0.0).mean())
 
 
-def loss(search: Search, step: Step) -> float:
+def loss(search: Search, step: JointFit) -> float:
     """The cost of a step; with input noise minus the log-likelihood, each step with the level that fits its residual.
 
     Input noise is loud where it masks an effect.
@@ -112,20 +112,20 @@ def loss(search: Search, step: Step) -> float:
     return likeliest_share(rig, search.data, search.data.differences(rig)).loss
 
 
-def _gain(search: Search, best: Step, step: Step) -> float:
+def _gain(search: Search, best: JointFit, step: JointFit) -> float:
     """Twice the log-likelihood ratio of one step over another, per measured value."""
     if not search.logged:
         return float(np.log(step.fit.cost / best.fit.cost))
     return 2.0 * (loss(search, step) - loss(search, best)) / search.data.n_values
 
 
-def is_likelier(search: Search, best: Step, step: Step, least: float = SEARCH.significant) -> bool:
+def is_likelier(search: Search, best: JointFit, step: JointFit, least: float = SEARCH.significant) -> bool:
     """Whether the likelihood surely prefers a set to a smaller one, beyond the imperfection of any model."""
     extra, gain = max(best.fit.n_parameters - step.fit.n_parameters, 1), _gain(search, best, step)
     return gain > least and search.pays(gain, extra)
 
 
-def surely_prefers(search: Search, best: Step, simpler: Step) -> bool:
+def surely_prefers(search: Search, best: JointFit, simpler: JointFit) -> bool:
     """Whether the best step explains the records and its likelihood is surely higher than that of a simpler one."""
     extra, gain = best.fit.n_parameters - simpler.fit.n_parameters, _gain(search, best, simpler)
     return best.explains and search.pays(gain, extra)
@@ -139,7 +139,7 @@ def fit_jointly(
     rounds: int | None = None,
     known: np.ndarray | None = None,
     until_convergence: bool = False,
-) -> Step:
+) -> JointFit:
     """Effects and nominal errors fitted jointly, with prior variances of the errors by evidence maximisation.
 
     The most probable variances follow MacKay, Neural Computation 4 (1992) 415: s² = Σ a² / Σ (1 - v / s²) over the
@@ -247,7 +247,7 @@ def _with_prior_stds(errors: Effect, sizes: dict[str, float]) -> Effect:
     return replace(errors, target=replace(errors.target, **sizes))
 
 
-def evaluated(search: Search, found: Fit, substeps: int | None = None) -> Step:
+def evaluated(search: Search, found: Fit, substeps: int | None = None) -> JointFit:
     """A fit of effects and nominal errors (last) with its residual and noise evaluated on all records of a search.
 
     Args:
@@ -258,14 +258,14 @@ def evaluated(search: Search, found: Fit, substeps: int | None = None) -> Step:
         by_channel = data.by_channel(data.residual(rig))
         of_noise = np.ones_like(by_channel)
         step = replace(found, cost=float(by_channel.mean()), cost_by_channel=by_channel)
-        return Step(step, of_noise[0], search.logged, of_noise)
+        return JointFit(step, of_noise[0], search.logged, of_noise)
     residuals = data.differences(rig)
     with np.errstate(over="ignore", invalid="ignore"):
         by_channel = np.array([((r / data.noise[:, None]) ** 2).mean(axis=1) for r in residuals])
     if not np.isfinite(by_channel).all():  # the simulation diverged, so its residual shows no noise
         by_channel = np.full_like(by_channel, np.inf)
         step = replace(found, cost=np.inf, cost_by_channel=by_channel)
-        return Step(step, np.ones(data.noise.size), 0.0, np.ones_like(by_channel))
+        return JointFit(step, np.ones(data.noise.size), 0.0, np.ones_like(by_channel))
     with np.errstate(over="ignore", invalid="ignore"):  # powers of its prewhitened residual may overflow
         coloured = are_coloured(residuals)
         credible = np.inf if is_noise_alone(residuals, data.counted, coloured) else _largest_noise_ratio(data, coloured)
@@ -273,7 +273,7 @@ def evaluated(search: Search, found: Fit, substeps: int | None = None) -> Step:
     step = replace(found, cost=float(by_channel.mean()), cost_by_channel=by_channel)
     per_unit = search.logging_noise
     logged = logging_noise(by_channel, sensor_noise, per_unit)
-    return Step(step, sensor_noise, logged, sensor_noise + logged**2 * per_unit)
+    return JointFit(step, sensor_noise, logged, sensor_noise + logged**2 * per_unit)
 
 
 def _largest_noise_ratio(data: FitData, coloured: np.ndarray) -> Floats:

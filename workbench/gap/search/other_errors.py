@@ -11,7 +11,7 @@ from workbench.gap.effects.nominal import differing, figures_of
 from workbench.gap.search.errors_as_effects import PORT_GROUPS
 from workbench.gap.search.fit import finite_residual
 from workbench.gap.search.joint_starts import fit_from_zero
-from workbench.gap.search.jointly import Step, too_large
+from workbench.gap.search.jointly import JointFit, too_large
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import INTERVALS, RECORDS, STEPWISE
 from workbench.gap.search.stepwise import Stepwise
@@ -92,7 +92,7 @@ def _standard_error(residuals: Sequence[Floats], n_outputs: int) -> float:
     return float(np.sqrt(((blocks - blocks.mean()) ** 2).sum()) / max(float(along @ along), 1e-300))
 
 
-def _varying_parameter(search: Search, step: Step) -> Deviations | None:
+def _varying_parameter(search: Search, step: JointFit) -> Deviations | None:
     """The parameter whose variation from record to record surely removes much of the residual of a step, or None."""
     if len(search.data.records) < 2:
         return None

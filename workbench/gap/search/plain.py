@@ -24,14 +24,14 @@ from workbench.gap.search.finish import finished, other_places, ranked
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.joint_starts import surely_late, with_reading_sides
-from workbench.gap.search.jointly import Step
+from workbench.gap.search.jointly import JointFit
 from workbench.gap.search.screening import Screening, on_whole_records, one_more
 from workbench.gap.search.search import Search, first_of_each, promise
 from workbench.gap.search.settings import ERRORS, PAIRS, PLAIN, SEARCH, SELECTION, STEPWISE
 from workbench.rig.rig import Rig
 
 
-def in_place_of_nominal_errors(search: Search, step: Step, rivals: Sequence[tuple[Effect, ...]] = ()) -> Fit | None:
+def in_place_of_nominal_errors(search: Search, step: JointFit, rivals: Sequence[tuple[Effect, ...]] = ()) -> Fit | None:
     """A set of few effects that explains the records with no nominal errors but uniform ones and those of ports.
 
     Such a set needs fewer parameters than nominal errors of every mode or wave. None if there is none, or if the
@@ -50,7 +50,7 @@ def in_place_of_nominal_errors(search: Search, step: Step, rivals: Sequence[tupl
 
 
 def _with_port_errors(
-    search: Search, step: Step, rivals: Sequence[tuple[Effect, ...]], kept: tuple[Effect, ...]
+    search: Search, step: JointFit, rivals: Sequence[tuple[Effect, ...]], kept: tuple[Effect, ...]
 ) -> Fit | None:
     """The same as `in_place_of_nominal_errors`, given the errors of ports (`kept`) that stay."""
     effects = step.effects
@@ -76,7 +76,7 @@ def _with_port_errors(
 
 
 def _one_uniform_error(
-    search: Search, common: tuple[Effect, ...], kept: tuple[Effect, ...], both: Fit, step: Step
+    search: Search, common: tuple[Effect, ...], kept: tuple[Effect, ...], both: Fit, step: JointFit
 ) -> Fit | None:
     """One uniform error as the only effect, if the records do not show the other; else None.
 
@@ -108,7 +108,7 @@ def _with_common_causes(rig: Rig, kept: tuple[Effect, ...]) -> Iterator[tuple[Ef
         yield from ((effect,) for effect in delay_effects(rig, kept[0]) if effect.kind in DELAYS_OF_ALL)
 
 
-def _simplest_explaining(search: Search, sets: Sequence[tuple[Effect, ...]], step: Step) -> Fit | None:
+def _simplest_explaining(search: Search, sets: Sequence[tuple[Effect, ...]], step: JointFit) -> Fit | None:
     """The simplest set that explains the records, or a larger one that is surely likelier; else None.
 
     A set is rejected if the records surely prefer the nominal errors of the step, or if it contains the best so far.
@@ -136,7 +136,7 @@ def _simplest_explaining(search: Search, sets: Sequence[tuple[Effect, ...]], ste
     return None if best is None else _with_delay_as_effect(search, finished(search, best))
 
 
-def _is_surely_worse(search: Search, found: Fit, step: Step, data: FitData) -> bool:
+def _is_surely_worse(search: Search, found: Fit, step: JointFit, data: FitData) -> bool:
     """Whether the records surely prefer a step with plausible nominal errors to a fit without them."""
     if not step.is_plausible:
         return False
@@ -180,7 +180,7 @@ def _explaining_instead(search: Search, found: Fit, effect: Effect, causes: Sequ
     return [f for f in fits if search.explains(f)]
 
 
-def few_with_uniform_errors(search: Search, step: Step, most: int) -> Fit | None:
+def few_with_uniform_errors(search: Search, step: JointFit, most: int) -> Fit | None:
     """At most `most` effects that explain the records, added one by one to uniform stiffness and damping errors.
 
     None if an effect does not halve the residual, on whole records or one step ahead, or is a plausible error of a
@@ -220,7 +220,7 @@ def _subsets(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
 
 
 def _with_one_linear_effect(
-    search: Search, effects: tuple[Effect, ...], common: tuple[Effect, ...], step: Step
+    search: Search, effects: tuple[Effect, ...], common: tuple[Effect, ...], step: JointFit
 ) -> Fit | None:
     """The effects and one linear structural effect in place of the nominal errors of every mode or wave, or None."""
     linear_kinds = tuple(kind for kind in search.catalogue if is_linear_structural(kind))

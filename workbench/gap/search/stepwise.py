@@ -33,7 +33,7 @@ from workbench.gap.search.finish import PORTS, other_places
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.joint_starts import TIMING, fit_from_zero, fitted_to_all, fitted_to_quick, with_reading_sides
 from workbench.gap.search.jointly import (
-    Step,
+    JointFit,
     are_plausible,
     evaluated,
     fit_jointly,
@@ -70,7 +70,7 @@ class Stepwise:
     def __init__(self, search: Search, ahead: Sequence[Fit] = ()) -> None:
         self.ahead = ahead
         self.singles: Sequence[tuple[Effect, ...]] | None = None
-        self.known: Sequence[Step] = ()
+        self.known: Sequence[JointFit] = ()
         catalogue = tuple(kind for kind in search.catalogue if kind not in UNIFORM)
         self.search = replace(search, catalogue=catalogue or search.catalogue)
         self.at_first = self.search
@@ -80,17 +80,17 @@ class Stepwise:
         self.plain: Fit | None = None
         self.shows_unknown_law = False
         search.progress("small errors of the nominal model", 0.4)
-        self.steps: list[Step] = []
+        self.steps: list[JointFit] = []
         self.steps.append(fit_from_zero(self.search, ()))
         self._with_input_noise(self.last)
 
     @property
-    def last(self) -> Step:
+    def last(self) -> JointFit:
         """The last set."""
         return self.steps[-1]
 
     @property
-    def nearest(self) -> Step:
+    def nearest(self) -> JointFit:
         """The last set or the best single effect with nominal errors, whichever has the smaller residual."""
         return min((self.last, *self.fitted_singles), key=lambda s: s.fit.cost)
 
@@ -148,7 +148,7 @@ class Stepwise:
     # The first effect
 
     @cached_property
-    def fitted_singles(self) -> list[Step]:
+    def fitted_singles(self) -> list[JointFit]:
         """Single effects, each fitted jointly with nominal errors that start from zero, best first."""
         sets = [f.effects for f in self._likeliest_singles()] if self.singles is None else self.singles
         keys = {key_of(step.effects) for step in self.known}
@@ -371,7 +371,7 @@ class Stepwise:
         converged = fit_jointly(self.search, (), errors_only.errors, rounds=3, until_convergence=True)
         shortest = min(step.description(noise) for step in (errors_only, converged))
 
-        def is_found(step: Step) -> bool:
+        def is_found(step: JointFit) -> bool:
             saved = shortest - step.description(noise)
             likelier = partial(is_likelier, self.search, step, least=SEARCH.trifle)
             # errors iterated that far over-fit: an effect that saves much need not be likelier than those
@@ -409,7 +409,7 @@ class Stepwise:
             if is_same_size and not is_moved and not self._is_accepted(self.last, before):
                 break
 
-    def _with_another_law(self, step: Step) -> Step | None:
+    def _with_another_law(self, step: JointFit) -> JointFit | None:
         """The step with its one nonlinear law replaced by another at the same place, if that removes enough.
 
         The first effect is searched beside nominal errors that have absorbed part of it, and where those are far off, a
@@ -444,7 +444,7 @@ class Stepwise:
         best, *rest = sorted((step, *others), key=partial(loss, search))
         return replace(best, others=(best, *rest)) if best is not step and self._is_accepted(best, step) else None
 
-    def _at_another_place(self, step: Step) -> Step | None:
+    def _at_another_place(self, step: JointFit) -> JointFit | None:
         """The step with its one linear structural effect moved to another place, if that has a smaller loss.
 
         Smooth nominal errors approximate such an effect at any place. The cost therefore has a local minimum at every
@@ -462,7 +462,7 @@ class Stepwise:
         best = min(whole, key=partial(loss, self.search), default=step)
         return best if loss(self.search, best) < loss(self.search, step) else None
 
-    def _with_an_absorbed(self, step: Step) -> Step | None:
+    def _with_an_absorbed(self, step: JointFit) -> JointFit | None:
         """The step with one linear effect more that makes its implausible nominal errors much smaller, or None.
 
         Errors as large as those of the step may have absorbed that effect, and then leave no evidence of it. So the
@@ -481,7 +481,7 @@ class Stepwise:
         ]
         return replace(min(found, key=lambda s: s.description(noise)), others=tuple(found)) if found else None
 
-    def _with_one_more(self, step: Step) -> Step | None:
+    def _with_one_more(self, step: JointFit) -> JointFit | None:
         """The best set with one more effect, if it removes enough of the residual; else None."""
         self.tried_beside_input_noise = True
         tried = self._candidates_with_one_more(step)
@@ -497,7 +497,7 @@ class Stepwise:
         self.shows_unknown_law = self.search.clustered(best.effects)
         return None if self.shows_unknown_law else best
 
-    def _candidates_with_one_more(self, step: Step) -> list[Step]:
+    def _candidates_with_one_more(self, step: JointFit) -> list[JointFit]:
         """The likeliest sets with one more effect, fitted to the two most informative records."""
         quick, first = most_informative(self.search.data, step.fit.cost_by_channel)
         self.search = search = replace(self.search, quick=quick, first=first)
@@ -524,7 +524,7 @@ class Stepwise:
         chosen = [*chosen[: STEPWISE.candidates], *more_general_sets(step.effects)]
         return fitted_to_quick(self.search, chosen, step)
 
-    def _best_of(self, tried: Sequence[Step], step: Step) -> Step:
+    def _best_of(self, tried: Sequence[JointFit], step: JointFit) -> JointFit:
         """The best set on all records, of candidates fitted to the most informative ones."""
         # the single effects fitted before nominal errors could absorb them compete too
         singles = [] if step.effects else self.fitted_singles
@@ -537,19 +537,19 @@ class Stepwise:
         whole = sorted((*whole, *singles), key=partial(loss, search))
         return self._simplest(whole[0], whole[1:]) if whole else step
 
-    def _simplest(self, best: Step, tried: Sequence[Step], others: Sequence[Step] = ()) -> Step:
+    def _simplest(self, best: JointFit, tried: Sequence[JointFit], others: Sequence[JointFit] = ()) -> JointFit:
         """The best step, or a simpler one that fits almost as well; its competitors are `others`, or those tried."""
         found = simplest_step(self.search, best, tried, self.ahead, self._gap)
         return replace(found, others=tuple(others or (best, *tried)))
 
-    def _reselected(self, step: Step) -> Step:
+    def _reselected(self, step: JointFit) -> JointFit:
         """The best of a step and its competitors (`others`), refitted in the current search."""
         others = [s for s in step.others if key_of(s.effects) != key_of(step.effects)]
         refitted = self.search.side_by_side(fitted_to_all, others)
         best, *rest = sorted((step, *refitted), key=partial(loss, self.search))
         return self._simplest(best, rest)
 
-    def _is_accepted(self, best: Step, step: Step) -> bool:
+    def _is_accepted(self, best: JointFit, step: JointFit) -> bool:
         """Whether a set removes enough of the residual of a smaller one, or makes its nominal errors plausible."""
         if not self.search.are_noticeable(best.effects, best.fit.effects):
             return False
@@ -566,7 +566,7 @@ class Stepwise:
         longer, shorter = (s.description(noise, of_errors_alone=is_negligible) for s in (step, best))
         return not step.is_plausible and longer - shorter > STEPWISE.shorter
 
-    def _without_errors(self, step: Step) -> Fit | None:
+    def _without_errors(self, step: JointFit) -> Fit | None:
         """Few effects that explain the records without nominal errors as well as a step with them, or None."""
         if not self.closes_gap:
             return None
@@ -599,7 +599,7 @@ class Stepwise:
 
     # Input noise and substeps, with which the selection continues
 
-    def _with_input_noise(self, step: Step) -> Step | None:
+    def _with_input_noise(self, step: JointFit) -> JointFit | None:
         """The step refitted with input noise, if that whitens its residual; else None.
 
         The selection continues, and the steps before are evaluated, with input noise of the level that the residual
@@ -631,7 +631,7 @@ class Stepwise:
             return None
         return self._continue_in(noisy, step, fitted)
 
-    def _in_place_of_inputs(self, step: Step) -> Step | None:
+    def _in_place_of_inputs(self, step: JointFit) -> JointFit | None:
         """The step with one more effect that explains the records without input noise, or None."""
         tried = [s for s in self._candidates_with_one_more(step) if not may_be_port_errors(self.search, s.effects)]
         near = _finalists(sorted(tried, key=lambda s: s.fit.cost), PLAIN.near)
@@ -642,13 +642,13 @@ class Stepwise:
         best, *rest = sorted(found, key=lambda s: s.fit.cost)
         return self._simplest(best, rest)
 
-    def _continue_in(self, search: Search, step: Step, fitted: Step) -> Step:
+    def _continue_in(self, search: Search, step: JointFit, fitted: JointFit) -> JointFit:
         """`fitted`, the step refitted in another search; the selection continues in that search."""
         self.search, self.tried_beside_input_noise = search, False
         self.steps = [fitted if s is step else replace(evaluated(search, s.fit), others=s.others) for s in self.steps]
         return fitted
 
-    def _with_finer_substeps(self, step: Step) -> Step:
+    def _with_finer_substeps(self, step: JointFit) -> JointFit:
         """The step refitted with substeps fine enough to be exact, if its residual is close to the noise floor.
 
         The selection continues with these substeps: the error of coarser ones would pass for another effect.
@@ -715,7 +715,7 @@ class Stepwise:
         likely = sorted(zip(sets[1:], odds[1:] / odds.sum(), strict=True), key=lambda each: -each[1])
         return tuple((s.fit, float(p)) for s, p in likely if p > STEPWISE.excluded)
 
-    def _others(self) -> list[Step]:
+    def _others(self) -> list[JointFit]:
         """The last set as it was selected, then the other candidates that explain the records or fit as well."""
         key = key_of(self.last.effects)
         chosen = next((s for s in reversed(self.steps) if s.others and key_of(s.effects) == key), None)
@@ -732,6 +732,6 @@ def _cost_ahead(search: Search, rig: Rig) -> float:
     return float(residual @ residual) / residual.size
 
 
-def _finalists(steps: Sequence[Step], cost_limit: float) -> list[Step]:
+def _finalists(steps: Sequence[JointFit], cost_limit: float) -> list[JointFit]:
     """The first of some steps that cost less than a limit on the most informative records."""
     return [step for step in steps if step.fit.cost < cost_limit][: STEPWISE.finalists]

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from workbench.identification.free_decay.refinement import in_coloured_noise, refine
 from workbench.identification.signal.data_quality import dropouts, steps
 from workbench.identification.signal.modal_estimates import Refined
-from workbench.identification.signal.searches import Budget
+from workbench.identification.signal.searches import TimeLimit
 from workbench.records.record import Record, as_records
 from workbench.renamed import Renamed
 from workbench.structure.damping import ProportionalDamping
@@ -91,7 +91,7 @@ def amplitude_dependence(
     refined: Refined,
     *,
     stretches: int = ASSUMPTIONS.segments,
-    budget: Budget | None = None,
+    time_limit: TimeLimit | None = None,
 ) -> AmplitudeDependence:
     """Frequency and damping of each mode of free decays by amplitude, in segments of the records.
 
@@ -99,7 +99,7 @@ def amplitude_dependence(
         records: the free decays that `refined` was identified from.
         refined: their modes.
         stretches: number of segments of each record, each twice as long as the one before.
-        budget: time limit, after which no further segment is analysed; none unless given.
+        time_limit: of processor time, after which no further segment is analysed; none unless given.
 
     Raises:
         ValueError: fewer than two segments.
@@ -108,8 +108,8 @@ def amplitude_dependence(
         raise ValueError(f"amplitudes are compared over two stretches or more; got {stretches}")
     records = as_records(records)
     each = zip(records, refined.amplitudes, refined.noise, strict=True)
-    budget = Budget() if budget is None else budget
-    values = [_segments(record, refined, np.abs(a), noise, stretches, budget) for record, a, noise in each]
+    time_limit = TimeLimit() if time_limit is None else time_limit
+    values = [_segments(record, refined, np.abs(a), noise, stretches, time_limit) for record, a, noise in each]
     start = np.concatenate([each[0] for each in values])
     amplitude, omega, omega_std, zeta, zeta_std = (frozen(rows) for rows in np.hstack([each[1] for each in values]))
     probability = np.stack(
@@ -125,7 +125,7 @@ def amplitude_dependence(
 
 
 def _segments(
-    record: Record, refined: Refined, size: np.ndarray, noise: np.ndarray, stretches: int, budget: Budget
+    record: Record, refined: Refined, size: np.ndarray, noise: np.ndarray, stretches: int, time_limit: TimeLimit
 ) -> tuple[np.ndarray, np.ndarray]:
     """Starts of the segments of a record, (n_segments,) s, and the modes in each, (5, n_segments, n_modes).
 
@@ -154,11 +154,11 @@ def _segments(
         segment = record.between(begins, ends)
         if (segment.outputs.std(axis=1) < least_rms).any():  # quantisation distorts so small a motion
             continue
-        if budget.spent("comparison of modes by amplitude"):
+        if time_limit.spent("comparison of modes by amplitude"):
             break
         try:
             refitted = in_coloured_noise(
-                refine(segment, modes.select(list(significant)), offset=True, budget=budget), segment
+                refine(segment, modes.select(list(significant)), offset=True, time_limit=time_limit), segment
             )
         except np.linalg.LinAlgError:
             continue

@@ -34,7 +34,7 @@ from workbench.identification.free_decay.refinement import (
 )
 from workbench.identification.signal.modal_estimates import Identified
 from workbench.identification.signal.projection import forget_transforms, independent, project
-from workbench.identification.signal.searches import FALSE_ALARM, FIT, FURTHER, SELECTION, Budget, spurious_modes
+from workbench.identification.signal.searches import FALSE_ALARM, FIT, FURTHER, SELECTION, TimeLimit, spurious_modes
 from workbench.records.record import Record
 from workbench.threads import cores
 
@@ -66,7 +66,7 @@ LONG = LongSettings()
 
 
 def identify_long(
-    records: Sequence[Record], *, max_modes: int, false_alarm: float = FALSE_ALARM, budget: Budget | None = None
+    records: Sequence[Record], *, max_modes: int, false_alarm: float = FALSE_ALARM, time_limit: TimeLimit | None = None
 ) -> Identified | None:
     """The modes of long records, their number selected; None where none is significant.
 
@@ -74,15 +74,15 @@ def identify_long(
         records: free decay in white noise, of the same sensors at one rate; each output may hold a constant.
         max_modes: largest number of modes.
         false_alarm: probability that noise alone is taken for a mode.
-        budget: time limit; none unless given.
+        time_limit: of processor time; none unless given.
     """
-    measured = _Search(records, false_alarm, budget or Budget())
+    measured = _Search(records, false_alarm, time_limit or TimeLimit())
     measured.run(max_modes)
     uncorrelated = independent(records, [fit.residual.T for fit in measured.fits]) if measured.poles.size else None
     if uncorrelated is None:
         return measured.report(measured.statistic()) if measured.poles.size else None
     # Correlated noise makes peaks in all outputs; combinations of uncorrelated noise do without them.
-    mixed = _Search(uncorrelated[0], false_alarm, measured.budget)
+    mixed = _Search(uncorrelated[0], false_alarm, measured.time_limit)
     mixed.origins = measured.origins
     mixed.settle(measured.poles, LONG.steps)
     mixed.run(max_modes)
@@ -103,8 +103,8 @@ class _Search:
         fine: χ² of the lowest decay rate in the residual, by frequency.
     """
 
-    def __init__(self, records: Sequence[Record], false_alarm: float, budget: Budget) -> None:
-        self.records, self.budget = records, budget
+    def __init__(self, records: Sequence[Record], false_alarm: float, time_limit: TimeLimit) -> None:
+        self.records, self.time_limit = records, time_limit
         self.dt, self.longest = records[0].sample_time, max(r.n_samples for r in records)
         self.span = self.longest * self.dt
         self.bin_width = 2.0 * np.pi / self.span
@@ -128,7 +128,7 @@ class _Search:
         for _ in range(LONG.most_rounds):
             before = self.poles.size
             # The first modes are searched whatever the time.
-            ended = fruitless >= LONG.most_fruitless or (before > 0 and self.budget.spent(FURTHER))
+            ended = fruitless >= LONG.most_fruitless or (before > 0 and self.time_limit.spent(FURTHER))
             peaks = np.zeros(0) if ended else self.peaks()[: max(max_modes - before, 0)]
             if peaks.size:
                 self.origins = np.append(self.origins, peaks)
@@ -137,7 +137,7 @@ class _Search:
                 fruitless = 0 if self.poles.size > before else fruitless + 1
             else:
                 self.settle(self.poles, FIT.most_steps)
-                if not self.remove(thoroughly=not self.budget.spent("check of each mode")):
+                if not self.remove(thoroughly=not self.time_limit.spent("check of each mode")):
                     break
 
     def settle(self, poles: np.ndarray, most_steps: int) -> None:
@@ -145,7 +145,7 @@ class _Search:
         self.poles, self.converged, self.steps = poles, True, 0
         if poles.size:
             self.poles, self.fits, self.converged, self.steps = search(
-                self.records, poles, self.weights, True, most_steps, hold=True, budget=self.budget
+                self.records, poles, self.weights, True, most_steps, hold=True, time_limit=self.time_limit
             )
         else:
             self.fits = [project(record, poles, True) for record in self.records]
@@ -214,7 +214,7 @@ class _Search:
         refined = as_refined(*fit, converged=self.converged, steps=self.steps)
         refined = in_coloured_noise(refined, self.records, self.fits)
         statistic = statistic[np.argsort(np.abs(self.poles))]
-        return identified(refined, statistic, self.limit, self.rejected, self.records[0], self.budget.remarks)
+        return identified(refined, statistic, self.limit, self.rejected, self.records[0], self.time_limit.remarks)
 
     def _size(self, rate: float) -> tuple[int, int]:
         """Samples that an exponential of this decay rate lasts, and the length of a transform that resolves it."""

@@ -50,9 +50,9 @@ from workbench.identification.signal.searches import (
     SECONDS,
     SELECTION,
     STOPPED,
-    Budget,
+    OrderSelection,
     Progress,
-    Stepwise,
+    TimeLimit,
     check_count,
     overdamped,
     spurious_modes,
@@ -121,13 +121,13 @@ def identify(
     """
     check_count("max_modes", max_modes)
     records = of_same_sensors(records)
-    budget = Budget(seconds, progress)
-    result = identify_within(records, budget, max_modes=max_modes, false_alarm=false_alarm)
+    time_limit = TimeLimit(seconds, progress)
+    result = identify_within(records, time_limit, max_modes=max_modes, false_alarm=false_alarm)
     result = result.without_artefacts(np.pi / records[0].sample_time)
     start_remarks = tuple(remark for record in records for remark in (*_driven(record), *_starts_later(record)))
-    by_amplitude = amplitude_dependence(records, result.refined, budget=budget)
+    by_amplitude = amplitude_dependence(records, result.refined, time_limit=time_limit)
     other_remarks = tuple(remark for remark in result.remarks if not remark.startswith(STOPPED))
-    return replace(result, remarks=(*start_remarks, *other_remarks, *budget.remarks, *by_amplitude.remarks))
+    return replace(result, remarks=(*start_remarks, *other_remarks, *time_limit.remarks, *by_amplitude.remarks))
 
 
 def _driven(record: Record) -> tuple[str, ...]:
@@ -161,9 +161,9 @@ def _starts_later(record: Record) -> tuple[str, ...]:
 
 
 def identify_within(
-    records: Sequence[Record], budget: Budget, *, max_modes: int | None = None, false_alarm: float = FALSE_ALARM
+    records: Sequence[Record], time_limit: TimeLimit, *, max_modes: int | None = None, false_alarm: float = FALSE_ALARM
 ) -> Identified:
-    """`identify` within the time left of `budget`, artefacts included."""
+    """`identify` within the time left of `time_limit`, artefacts included."""
     for record in records:
         check_data_quality(record)
     shortest = min(records, key=lambda record: record.n_samples)
@@ -173,7 +173,7 @@ def identify_within(
     is_long = sum(r.outputs.size for r in records) > ORDER.long
     most = min(max_modes or (10 if is_long else 1) * ORDER.max_modes, most)
     select = identify_long if is_long else _identify_stepwise
-    found = select(records, max_modes=most, false_alarm=false_alarm, budget=budget)
+    found = select(records, max_modes=most, false_alarm=false_alarm, time_limit=time_limit)
     if found is None:
         raise ValueError(
             f"record {records[0].name!r} holds no mode that rises above its noise: is it a free decay? Cut it to the"
@@ -183,15 +183,17 @@ def identify_within(
 
 
 def _identify_stepwise(
-    records: Sequence[Record], *, max_modes: int, false_alarm: float, budget: Budget
+    records: Sequence[Record], *, max_modes: int, false_alarm: float, time_limit: TimeLimit
 ) -> Identified | None:
     """The modes by stepwise selection, in the records as measured and then whitened; None where none is significant."""
-    search_time = budget.share(SELECTION.search_share)
+    search_time = time_limit.share(SELECTION.search_share)
     verdicts: Verdicts = []
 
     def selected(some: Sequence[Record]) -> tuple[_FreeDecay, _Model]:
         problem = _FreeDecay(some, false_alarm, records, search_time, verdicts)
-        selection = Stepwise(problem, max_modes, ORDER.most_weak, ORDER.most_splits, False, search_time, alone=True)
+        selection = OrderSelection(
+            problem, max_modes, ORDER.most_weak, ORDER.most_splits, False, search_time, alone=True
+        )
         model = selection.select(problem.nothing)
         problem.rejected = selection.rejected
         return problem, model
@@ -215,7 +217,7 @@ def _identify_stepwise(
         ):
             fewer = other.fitted(all_modes, fewer.weights)
         problem, model = other, fewer
-    problem.budget = budget
+    problem.time_limit = time_limit
     return problem.report(model) if model.poles.size else None
 
 
@@ -268,11 +270,11 @@ class _FreeDecay:
         records: Sequence[Record],
         false_alarm: float,
         measured: Sequence[Record],
-        budget: Budget,
+        time_limit: TimeLimit,
         verdicts: Verdicts,
     ) -> None:
         longest = max(record.n_samples for record in records)
-        self.records, self.measured, self.budget = records, measured, budget
+        self.records, self.measured, self.time_limit = records, measured, time_limit
         self.grids = [_Grid(record, longest) for record in records]
         # Residuals at round-off level do not show how noise differs between sensors.
         self.round_off = FIT.round_off * np.array([(record.outputs**2).sum(axis=1) for record in records]) + 1e-300
@@ -401,17 +403,17 @@ class _FreeDecay:
     def report(self, model: _Model) -> Identified:
         """The modes refined in the records as measured: whitening filters lose the first samples, the strongest."""
         poles, records = model.poles, self.measured
-        if self.budget.unfinished:  # perhaps before all modes were tested
+        if self.time_limit.unfinished:  # perhaps before all modes were tested
             spurious = self._spurious(model, model)
             poles = poles[~spurious] if not spurious.all() else poles
             self.rejected += [(complex(pole), 0.0) for pole in model.poles if pole not in poles]
-        refined = refine(records, unshaped(poles, records[0]), offset=True, budget=self.budget)
+        refined = refine(records, unshaped(poles, records[0]), offset=True, time_limit=self.time_limit)
         while (lost := self._lost(poles, refined.modes.poles)).any() and not lost.all():
             poles = poles[~lost]
-            refined = refine(records, unshaped(poles, records[0]), offset=True, budget=self.budget)
+            refined = refine(records, unshaped(poles, records[0]), offset=True, time_limit=self.time_limit)
         statistic = replace(model, poles=poles, fits=self._projected(poles)).statistic[np.argsort(np.abs(poles))]
         refined = in_coloured_noise(refined, records)
-        return identified(refined, statistic, self.limit, self.rejected, records[0], self.budget.remarks)
+        return identified(refined, statistic, self.limit, self.rejected, records[0], self.time_limit.remarks)
 
     def _lost(self, poles: np.ndarray, refined: np.ndarray) -> np.ndarray:
         """Which modes moved away or became overdamped in the refinement, fitted to a part of the record that is no
@@ -431,7 +433,9 @@ class _FreeDecay:
         """
         most_steps, enough = (SELECTION.few_steps, ORDER.decided) if decide else (FIT.most_steps, FIT.negligible)
         if poles.size:
-            poles, fits, *_ = search(self.records, poles, weights, True, most_steps, enough=enough, budget=self.budget)
+            poles, fits, *_ = search(
+                self.records, poles, weights, True, most_steps, enough=enough, time_limit=self.time_limit
+            )
         else:
             fits = self._projected(poles)
         n, squares = np.array([r.n_samples for r in self.records]), _squares([fit.residual for fit in fits])

@@ -34,7 +34,7 @@ from workbench.identification.signal.projection import (
     project,
     variances,
 )
-from workbench.identification.signal.searches import FIT, Budget, minimise
+from workbench.identification.signal.searches import FIT, TimeLimit, minimise
 from workbench.records.record import Record, as_records
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread
@@ -273,7 +273,11 @@ def _ratio_covariance(
 
 @one_blas_thread
 def refine(
-    records: Record | Sequence[Record], start: SampledModes, *, offset: bool = False, budget: Budget | None = None
+    records: Record | Sequence[Record],
+    start: SampledModes,
+    *,
+    offset: bool = False,
+    time_limit: TimeLimit | None = None,
 ) -> Refined:
     """The maximum likelihood modes near `start`, with the Cramér-Rao covariance of frequencies, damping and shapes.
 
@@ -283,7 +287,7 @@ def refine(
         records: free decay in white noise, of the same sensors at one rate.
         start: from `stacked_delays`; its shapes are not used.
         offset: whether each output may also hold a constant.
-        budget: time limit; none unless given.
+        time_limit: of processor time; none unless given.
 
     Returns:
         `Refined`; check `converged`: a start with modes that the record does not hold may not converge.
@@ -304,7 +308,7 @@ def refine(
     steps = 0
     for _ in range(2):
         # Noise differs between sensors and between records: it is estimated at the first optimum.
-        poles, fit, converged, taken = search(records, poles, weights, offset, budget=budget)
+        poles, fit, converged, taken = search(records, poles, weights, offset, time_limit=time_limit)
         steps += taken
         noise = noise_level(records, fit, weights)
         weights = 1.0 / noise
@@ -361,7 +365,7 @@ def search(
     *,
     hold: bool = False,
     enough: float = FIT.negligible,
-    budget: Budget | None = None,
+    time_limit: TimeLimit | None = None,
 ) -> tuple[np.ndarray, list[Projection], bool, int]:
     """Least squares over (σ, ω_d) of all modes.
 
@@ -376,14 +380,14 @@ def search(
         most_steps: largest number of steps.
         hold: see above.
         enough: predicted decrease of χ², per value, at which the search ends.
-        budget: time limit; none unless given.
+        time_limit: of processor time; none unless given.
 
     Returns:
         poles, projections (one per record), whether the search converged, and the number of steps.
     """
     start = _Fitted(poles, [project(record, poles, offset) for record in records])
     problem = _Poles(start, records, weights, offset, hold, enough)
-    minimum = minimise(problem, start, most_steps=most_steps, round_off=problem.round_off, budget=budget)
+    minimum = minimise(problem, start, most_steps=most_steps, round_off=problem.round_off, time_limit=time_limit)
     return minimum.state.poles, minimum.state.fits, minimum.converged, minimum.steps
 
 

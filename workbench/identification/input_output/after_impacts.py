@@ -16,7 +16,7 @@ from workbench.identification.free_decay.order import identify_within
 from workbench.identification.input_output.time_variance import IS_MEAN
 from workbench.identification.signal.harmonics import overtone_remarks
 from workbench.identification.signal.modal_estimates import Refined
-from workbench.identification.signal.searches import Budget
+from workbench.identification.signal.searches import TimeLimit
 from workbench.records.record import Record
 
 
@@ -78,21 +78,21 @@ class AfterImpacts:
         return matches
 
 
-def after_impacts(records: Sequence[Record], budget: Budget) -> AfterImpacts:
+def after_impacts(records: Sequence[Record], time_limit: TimeLimit) -> AfterImpacts:
     """The amplitude-dependent modes, where every record ends in free decay; none otherwise.
 
     Args:
         records: inputs zero between impacts.
-        budget: of the identification; a share of it is used.
+        time_limit: of the identification; a share of it is used.
     """
     decays = [_free_decay(record) for record in records]
     if not all(decays):
         return AfterImpacts()
     free = [decay for decay in decays if decay is not None]
-    share = budget.aside(AFTER_IMPACTS.share)
+    share = time_limit.aside(AFTER_IMPACTS.share)
     with suppress(ValueError, np.linalg.LinAlgError):  # no mode in free decay: the driven response alone is used
         refined = identify_within(free, share).without_artefacts(np.pi / free[0].sample_time).refined
-        by_amplitude = amplitude_dependence(free, refined, budget=share)
+        by_amplitude = amplitude_dependence(free, refined, time_limit=share)
         if not share.unfinished:
             return _significant(refined, by_amplitude)
     return AfterImpacts()

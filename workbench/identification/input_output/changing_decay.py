@@ -31,7 +31,7 @@ from workbench.identification.input_output.rivals import (
     projected_residual,
 )
 from workbench.identification.input_output.spectral_lines import Lines, rows_of_pair
-from workbench.identification.signal.searches import Budget, Once
+from workbench.identification.signal.searches import Once, TimeLimit
 from workbench.structure.modes import mac
 
 
@@ -50,14 +50,14 @@ class ChangingDecaySettings:
 DECAY = ChangingDecaySettings()
 
 
-def beside_changing(lines: Lines, fit: Fit, limit: float, budget: Budget) -> tuple[Lines, Fit] | None:
+def beside_changing(lines: Lines, fit: Fit, limit: float, time_limit: TimeLimit) -> tuple[Lines, Fit] | None:
     """The lines with the columns of changing modes, and the fit with one mode for each of these.
 
     Args:
         lines: FRFs.
         fit: of linear modes.
         limit: χ² threshold of a linear mode.
-        budget: of time.
+        time_limit: of time.
 
     Returns:
         None where linear modes are likelier at every peak.
@@ -70,7 +70,7 @@ def beside_changing(lines: Lines, fit: Fit, limit: float, budget: Budget) -> tup
         fit,
         alike & within & within[:, None],
         lambda lines, cluster: _rival_of(lines, fit, cluster, limit),
-        budget,
+        time_limit,
     )
 
 

@@ -26,7 +26,7 @@ from workbench.identification.input_output.rivals import (
     beyond_linear,
     diverged,
 )
-from workbench.identification.signal.searches import Budget
+from workbench.identification.signal.searches import TimeLimit
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def in_place_of(
     cluster: np.ndarray,
     rows: Floats,
     limit: float,
-    budget: Budget,
+    time_limit: TimeLimit,
     linear: list[np.ndarray],
 ) -> tuple[KnownInputs, complex] | None:
     """`in_place_of_clusters`, for one cluster: the records beside the changing mode, and its pole.
@@ -104,7 +104,7 @@ def in_place_of(
     n_coefficients = cluster.size * (n_excitations + 1) - n_excitations
     given_up: set[Law] = set()
     for law in LAWS:
-        if budget.spent(CHANGE_CHECK):
+        if time_limit.spent(CHANGE_CHECK):
             break
         by_time, powers = law
         parts = {other for other in LAWS if other[0] == by_time and set(other[1]) < set(powers)}
@@ -112,7 +112,7 @@ def in_place_of(
             continue
         fewer = (n_coefficients - len(powers) - 1) / (n_excitations + 1)  # unknowns, in those of a mode
         try:
-            changing = response.fitted(law, squares + limit * fewer / response.values.size, budget)
+            changing = response.fitted(law, squares + limit * fewer / response.values.size, time_limit)
         except _GivenUp as end:
             given_up.add(law)
             if by_time and end.least > RESPONSE.linear:
@@ -306,7 +306,7 @@ class _Response:
         scaled = rows / self.fit.noise
         return np.asarray(scaled - basis @ (basis.T @ scaled))
 
-    def fitted(self, law: Law, threshold: float, budget: Budget) -> tuple[KnownInputs, complex] | None:
+    def fitted(self, law: Law, threshold: float, time_limit: TimeLimit) -> tuple[KnownInputs, complex] | None:
         """The records beside the changing mode of a law, and its pole; None where it leaves too large a residual.
 
         Args:
@@ -326,7 +326,7 @@ class _Response:
         beyond: list[float] = []
 
         def residual_of(x: Floats) -> Floats:
-            if budget.spent(CHANGE_CHECK):
+            if time_limit.spent(CHANGE_CHECK):
                 raise _GivenUp(min(beyond, default=0.0))
             unknowns[active] = x
             residual = self._residual(unknowns, law)[0] if beyond else at_start[0]
@@ -346,7 +346,7 @@ class _Response:
         try:
             least_squares(residual_of, best[active], jacobian_of, x_scale="jac", max_nfev=RESPONSE.most_tries)
         except _GivenUp:
-            if budget.is_past or min(beyond) > 0.0:
+            if time_limit.is_past or min(beyond) > 0.0:
                 raise
         if min(beyond) > 0.0:
             return None

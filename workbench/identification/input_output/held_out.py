@@ -17,7 +17,7 @@ from workbench.arrays import Flags, Floats
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, columns, only, projected, settled
 from workbench.identification.input_output.time_variance import IS_MEAN, named_near
-from workbench.identification.signal.searches import FALSE_ALARM, SELECTION, Budget
+from workbench.identification.signal.searches import FALSE_ALARM, SELECTION, TimeLimit
 from workbench.records.record import Record
 
 
@@ -44,7 +44,7 @@ HELD_OUT = HeldOutSettings()
 
 
 def without_unpredictive(
-    data: KnownInputs, fit: Fit, strength: Floats, budget: Budget
+    data: KnownInputs, fit: Fit, strength: Floats, time_limit: TimeLimit
 ) -> tuple[Fit, tuple[complex, ...]]:
     """The fit without modes that make the prediction worse, and the poles of the stronger modes these stood about.
 
@@ -74,7 +74,7 @@ def without_unpredictive(
         """Power of the prediction error in the second half of each record, (n_lines,), in units of the noise."""
         try:
             start = projected(half, fit.poles[list(kept)], fit.participation[list(kept)])
-            first_half = settled(half, start, SELECTION.few_steps, budget)
+            first_half = settled(half, start, SELECTION.few_steps, time_limit)
             with np.errstate(over="ignore", invalid="ignore"):
                 predicted = columns(whole, first_half.poles, first_half.participation)[0] @ first_half.coefficients
                 errors = whole.as_samples((whole.values - predicted) / noise)
@@ -97,7 +97,7 @@ def without_unpredictive(
         group = kept & modes
         if not (kept[r] and group.any() and (kept & ~group).any() and _is_in_both(whole, fit, r)):
             continue
-        if budget.spent("check of modes by what they predict"):
+        if time_limit.spent("check of modes by what they predict"):
             break
         band = omega[group].min() - 0.5 * reach[r], omega[group].max() + 0.5 * reach[r]
         if not residual_of_all.stands_out(*band):
@@ -108,7 +108,7 @@ def without_unpredictive(
                 distorted.append(complex(fit.poles[r]))
     if kept.all():
         return fit, ()
-    return settled(data, only(data, fit, kept), SELECTION.few_steps, budget), tuple(distorted)
+    return settled(data, only(data, fit, kept), SELECTION.few_steps, time_limit), tuple(distorted)
 
 
 def _first_half(record: Record) -> Record:

@@ -26,7 +26,7 @@ from workbench.identification.input_output.modal_fit import Fit, projected, sett
 from workbench.identification.input_output.model_order import ORDER, Selected, SelectionOptions
 from workbench.identification.input_output.selection import select, select_strongest, subspace_start
 from workbench.identification.signal.modal_estimates import time_derivatives
-from workbench.identification.signal.searches import FALSE_ALARM, SELECTION, Budget
+from workbench.identification.signal.searches import FALSE_ALARM, SELECTION, TimeLimit
 from workbench.records.record import Record
 
 
@@ -57,7 +57,7 @@ def select_with_delays(
     A delay by a fraction of a sample is estimated where the first response to an input is later than without delay, or
     where the input a sample earlier explains part of the residual.
     """
-    budget, first = options.budget, _first_lags(data.records)
+    time_limit, first = options.time_limit, _first_lags(data.records)
     if data.hold == "band-limited":
         return _select_with_band_limited_delays(data, first, options, strongest)
     whole = np.maximum(first - (0 if data.hold == "first" else 1), 0)
@@ -73,21 +73,21 @@ def select_with_delays(
             without_delay = undelayed, selected = select(data, options, select_strongest(data, options, strongest.fit))
             if selected.fit.poles.size <= strongest.fit.poles.size:
                 return without_delay
-            with_fraction = _with_free_fraction(undelayed, selected.fit, undelayed.delays, budget)
-            if not _act_later(*with_fraction).any() or budget.spent(DELAY_SEARCH):
+            with_fraction = _with_free_fraction(undelayed, selected.fit, undelayed.delays, time_limit)
+            if not _act_later(*with_fraction).any() or time_limit.spent(DELAY_SEARCH):
                 return without_delay
     undelayed = data
     data, selected = select(delayed, options, strongest)
     fit = selected.fit
     if fit.poles.size == 0:
         return without_delay if without_delay is not None else (data.delayed_by(whole), selected)
-    whole, fraction = _whole_and_fraction(data, fit, whole, budget)
-    if not whole.any() and not fraction.any() and not budget.spent(DELAY_SEARCH):
+    whole, fraction = _whole_and_fraction(data, fit, whole, time_limit)
+    if not whole.any() and not fraction.any() and not time_limit.spent(DELAY_SEARCH):
         if without_delay is not None:
             return without_delay
         return select(undelayed, options, select_strongest(undelayed, options, fit))
     delayed = data.delayed_by(whole + fraction)
-    return delayed, selected.refitted(settled(delayed, _for_other_delays(delayed, data, fit), budget=budget))
+    return delayed, selected.refitted(settled(delayed, _for_other_delays(delayed, data, fit), time_limit=time_limit))
 
 
 def _select_with_band_limited_delays(
@@ -101,19 +101,19 @@ def _select_with_band_limited_delays(
     for _ in range(DELAYS.rounds):  # so that no mode is fitted to the effect of a delay
         few, before = subspace_start(delayed, options), delayed
         if few.poles.size:
-            delayed, _ = _with_best_delays(delayed, few, options.budget)
+            delayed, _ = _with_best_delays(delayed, few, options.time_limit)
         if delayed is before:
             break
     delayed, selected = select(delayed, options, strongest if delayed is data else None)
     if not selected.fit.poles.size:
         return delayed, selected
-    improved, fit = _with_best_delays(delayed, selected.fit, options.budget)
+    improved, fit = _with_best_delays(delayed, selected.fit, options.time_limit)
     if improved is delayed:
         return delayed, selected
-    return improved, selected.refitted(settled(improved, fit, budget=options.budget))
+    return improved, selected.refitted(settled(improved, fit, time_limit=options.time_limit))
 
 
-def _with_best_delays(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[KnownInputs, Fit]:
+def _with_best_delays(data: KnownInputs, fit: Fit, time_limit: TimeLimit) -> tuple[KnownInputs, Fit]:
     """The data with the maximum likelihood delays of band-limited inputs, and the fit with participation factors to
     match; a delay is 0 where it is not significantly different."""
 
@@ -132,7 +132,7 @@ def _with_best_delays(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[Know
         # interpolation spreads a band-limited input ahead of its delay, so the first lag is too early
         whole = max(float(delays[i]), 0.0)
         middle_cost, after = at(whole), at(whole + 1.0)
-        while after < middle_cost and whole < DELAYS.most_lags and not budget.spent(DELAY_SEARCH):
+        while after < middle_cost and whole < DELAYS.most_lags and not time_limit.spent(DELAY_SEARCH):
             whole, middle_cost, after = whole + 1.0, after, at(whole + 2.0)
         lowest = max(whole - 1.0, 0.0)
         best = minimize_scalar(at, bounds=(lowest, whole + 1.0), method="bounded", options={"xatol": 1e-3})
@@ -144,15 +144,15 @@ def _with_best_delays(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[Know
     return other, _for_other_delays(other, data, fit)
 
 
-def _whole_and_fraction(data: KnownInputs, fit: Fit, whole: Floats, budget: Budget) -> tuple[Floats, Floats]:
+def _whole_and_fraction(data: KnownInputs, fit: Fit, whole: Floats, time_limit: TimeLimit) -> tuple[Floats, Floats]:
     """Delay of each input: whole samples, and the fraction of a sample, (n_inputs,) each, from a fit with any fraction.
 
     The first response detected is a sample late where the response before it was below the noise.
     """
     fraction = _fractions(data, fit)
     doubtful = (whole > 0) & (fraction == 0)
-    while doubtful.any() and not budget.spent(DELAY_SEARCH):
-        data, fit = _with_free_fraction(data, fit, whole - doubtful, budget)
+    while doubtful.any() and not time_limit.spent(DELAY_SEARCH):
+        data, fit = _with_free_fraction(data, fit, whole - doubtful, time_limit)
         fraction_before = _fractions(data, fit)
         reduced = doubtful & (fraction_before < 1.0)
         whole, fraction = whole - reduced, np.where(reduced, fraction_before, fraction)
@@ -264,10 +264,10 @@ def _direct_coefficients(pole: complex, dt: float, fraction: float, hold: str) -
     return of_1 * (1.0 - f) - factor * c_1, of_0 + of_1 * f - factor * c_0
 
 
-def _with_free_fraction(data: KnownInputs, fit: Fit, delays: Floats, budget: Budget) -> tuple[KnownInputs, Fit]:
+def _with_free_fraction(data: KnownInputs, fit: Fit, delays: Floats, time_limit: TimeLimit) -> tuple[KnownInputs, Fit]:
     """The data with inputs delayed by whole samples and any fraction, and a fit just precise enough for decisions."""
     other = data.delayed_by(delays, any_fraction=True)
-    return other, settled(other, _for_other_delays(other, data, fit), SELECTION.few_steps, budget, ORDER.decided)
+    return other, settled(other, _for_other_delays(other, data, fit), SELECTION.few_steps, time_limit, ORDER.decided)
 
 
 def _for_other_delays(other: KnownInputs, data: KnownInputs, fit: Fit) -> Fit:

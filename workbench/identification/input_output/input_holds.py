@@ -13,7 +13,7 @@ import numpy as np
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, projected, settled
 from workbench.identification.input_output.model_order import ORDER
-from workbench.identification.signal.searches import SELECTION, Budget
+from workbench.identification.signal.searches import SELECTION, TimeLimit
 from workbench.records.record import HOLDS
 
 WORDS = {
@@ -23,14 +23,14 @@ WORDS = {
 }
 
 
-def hold_remarks(data: KnownInputs, fit: Fit, threshold: float, budget: Budget) -> tuple[str, ...]:
+def hold_remarks(data: KnownInputs, fit: Fit, threshold: float, time_limit: TimeLimit) -> tuple[str, ...]:
     """A remark where another course of the inputs between samples is significantly likelier.
 
     Args:
         data: as identified.
         fit: of its modes.
         threshold: threshold of twice the log-likelihood ratio.
-        budget: of time.
+        time_limit: of time.
     """
     costs: dict[str, float] = {}
     for hold in HOLDS:
@@ -39,12 +39,12 @@ def hold_remarks(data: KnownInputs, fit: Fit, threshold: float, budget: Budget) 
         # the delay may be an artefact of the false hold
         whole = np.floor(data.delays)
         for delays in np.unique([data.delays, whole, np.maximum(whole - 1.0, 0.0)], axis=0):
-            if budget.spent("check of how inputs run between samples"):
+            if time_limit.spent("check of how inputs run between samples"):
                 return ()
             other = replace(data, hold=hold).delayed_by(delays)
             try:
                 start = projected(other, fit.poles, fit.participation)
-                refitted = settled(other, start, SELECTION.few_steps, budget, ORDER.decided)
+                refitted = settled(other, start, SELECTION.few_steps, time_limit, ORDER.decided)
             except np.linalg.LinAlgError:
                 continue
             # a fractional delay has a row fewer

@@ -21,7 +21,7 @@ from scipy.linalg import qr, solve_triangular
 from workbench.arrays import Floats
 from workbench.identification.signal.modal_estimates import normalised_shapes
 from workbench.identification.signal.projection import pole_blocks
-from workbench.identification.signal.searches import FIT, Budget, minimise
+from workbench.identification.signal.searches import FIT, TimeLimit, minimise
 from workbench.threads import at_once
 
 Pair = tuple[np.ndarray, np.ndarray]
@@ -392,7 +392,7 @@ def search(
     fit: Fit,
     noise: np.ndarray,
     most_steps: int = FIT.most_steps,
-    budget: Budget | None = None,
+    time_limit: TimeLimit | None = None,
     negligible: float = FIT.negligible,
     is_vain: Callable[[Fit], bool] = lambda fit: False,
 ) -> Fit:
@@ -407,7 +407,7 @@ def search(
     if (held != 1.0).any():
         fit = projected(data, fit.poles, fit.participation / held[:, None])
     problem = _OutputError(data, noise, negligible)
-    minimum = minimise(problem, fit, most_steps=most_steps, budget=budget, is_vain=is_vain)
+    minimum = minimise(problem, fit, most_steps=most_steps, time_limit=time_limit, is_vain=is_vain)
     return replace(minimum.state, converged=minimum.converged, steps=minimum.steps)
 
 
@@ -463,7 +463,7 @@ def settled(
     data: Measurement,
     fit: Fit,
     most_steps: int = FIT.most_steps,
-    budget: Budget | None = None,
+    time_limit: TimeLimit | None = None,
     negligible: float = FIT.negligible,
 ) -> Fit:
     """The fit searched, reweighted by the noise it estimates, and searched again; unchanged where the time is up.
@@ -471,10 +471,10 @@ def settled(
     A single output has no other to be weighted against.
     """
     for _ in range(2):
-        if fit.poles.size == 0 or (budget is not None and budget.spent("refinement")):
+        if fit.poles.size == 0 or (time_limit is not None and time_limit.spent("refinement")):
             break
         noise = fit.noise
-        fit = search(data, fit, noise, most_steps, budget, negligible)
+        fit = search(data, fit, noise, most_steps, time_limit, negligible)
         if fit.converged and noise.size == 1:
             break
     return fit

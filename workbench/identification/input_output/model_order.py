@@ -28,7 +28,7 @@ from workbench.identification.input_output.modal_fit import (
     search,
     settled,
 )
-from workbench.identification.signal.searches import FALSE_ALARM, SELECTION, Budget, Stepwise, overdamped
+from workbench.identification.signal.searches import FALSE_ALARM, SELECTION, OrderSelection, TimeLimit, overdamped
 from workbench.structure.modes import mac
 from workbench.threads import at_once
 
@@ -61,12 +61,12 @@ class SelectionOptions:
     Attributes:
         max_modes: largest number of modes.
         false_alarm: probability that noise alone is taken for a mode.
-        budget: of time.
+        time_limit: of time.
     """
 
     max_modes: int
     false_alarm: float = FALSE_ALARM
-    budget: Budget = field(default_factory=Budget)
+    time_limit: TimeLimit = field(default_factory=TimeLimit)
 
 
 Scored = tuple[float, np.ndarray, complex]  # gain, participation factors and pole of a candidate
@@ -105,7 +105,9 @@ def select_modes(
         is_tested: whether each mode of the start was tested in a selection from the same measurement.
     """
     problem = _Modes(data, options)
-    selection = Stepwise(problem, options.max_modes, ORDER.most_weak, None, forgets=True, budget=options.budget)
+    selection = OrderSelection(
+        problem, options.max_modes, ORDER.most_weak, None, forgets=True, time_limit=options.time_limit
+    )
     fit = projected(data, np.zeros(0, complex), np.zeros((0, problem.excitations), complex))
     if start is not None and is_tested:
         fit = start
@@ -210,7 +212,7 @@ class _Modes:
     """The `searches.Selection` of a measurement; a candidate is a pole and its participation factors."""
 
     def __init__(self, data: Measurement, options: SelectionOptions) -> None:
-        self.data, self.budget = data, options.budget
+        self.data, self.time_limit = data, options.time_limit
         self.excitations = data.responses((-0.1 + 0.5j) * data.highest)[0].shape[1]
         self._scored: tuple[Fit, list[Scored]] | None = None
         self.limit = float(chi2.isf(options.false_alarm / data.cells, 2 * (data.values.shape[1] + self.excitations)))
@@ -261,7 +263,7 @@ class _Modes:
 
     def extended(self, model: Fit, candidate: tuple[complex, np.ndarray]) -> Fit:
         start = self._among_near(model, *candidate)
-        return search(self.data, start, model.noise, ORDER.steps, self.budget, ORDER.decided, _is_overdamped)
+        return search(self.data, start, model.noise, ORDER.steps, self.time_limit, ORDER.decided, _is_overdamped)
 
     def _among_near(self, model: Fit, pole: complex, participation: np.ndarray) -> Fit:
         """A model and a candidate, which in a long record is first fitted to what the modes far from it leave.
@@ -283,7 +285,7 @@ class _Modes:
             at_near = np.concatenate([near[:-1], n + near[:-1]])
             left.values = model.residual + (phi @ model.coefficients[at_near]) * row_weights(data)
             start = projected(left, poles[near], factors[near])
-            fit = search(left, start, model.noise, ORDER.steps, self.budget, ORDER.decided, _is_overdamped)
+            fit = search(left, start, model.noise, ORDER.steps, self.time_limit, ORDER.decided, _is_overdamped)
             if not _is_overdamped(fit) and not np.delete(are_near(fit.poles[-1]), near[:-1]).any():
                 poles[near], factors[near] = fit.poles, fit.participation
         return projected(data, poles, factors)
@@ -302,7 +304,7 @@ class _Modes:
         return bool(_spurious(self.data, trial).any() or is_about_distorted(self.data, trial.poles[-1:]).any())
 
     def settled(self, model: Fit) -> Fit:
-        return settled(self.data, model, budget=self.budget)
+        return settled(self.data, model, time_limit=self.time_limit)
 
     def started(self, start: Fit, times: float = 1.0) -> Fit:
         """The start fitted, without modes that are spurious or below the threshold.
@@ -312,8 +314,8 @@ class _Modes:
         Args:
             times: factor of the threshold that the χ² of a mode must exceed.
         """
-        model = settled(self.data, start, SELECTION.few_steps, self.budget, ORDER.decided)
-        while model.poles.size and not self.budget.spent("check of each mode"):
+        model = settled(self.data, start, SELECTION.few_steps, self.time_limit, ORDER.decided)
+        while model.poles.size and not self.time_limit.spent("check of each mode"):
             statistic = np.where(_spurious(self.data, model), 0.0, marginal_statistics_of(model))
             is_weak = statistic < [times * self.threshold(model, pole) for pole in model.poles]
             removable = np.flatnonzero(is_weak & ~_is_nonlinear(self.data, model.poles))
@@ -321,7 +323,9 @@ class _Modes:
                 break
             removed = removable[np.argsort(statistic[removable])[: (removable.size + 1) // 2]]
             rest = np.delete(np.arange(model.poles.size), removed)
-            model = settled(self.data, only(self.data, model, rest), SELECTION.few_steps, self.budget, ORDER.decided)
+            model = settled(
+                self.data, only(self.data, model, rest), SELECTION.few_steps, self.time_limit, ORDER.decided
+            )
         return self.settled(model)
 
     def suspects(self, model: Fit) -> Iterator[tuple[complex, Fit, bool]]:
@@ -336,7 +340,7 @@ class _Modes:
             doubtful = is_close and statistic[r] < ORDER.distinct * threshold
             if spurious[r] or doubtful or statistic_of(model, r) < SELECTION.weak * threshold:
                 without = only(self.data, model, np.delete(np.arange(model.poles.size), r))
-                without = settled(self.data, without, SELECTION.few_steps, self.budget, ORDER.decided)
+                without = settled(self.data, without, SELECTION.few_steps, self.time_limit, ORDER.decided)
                 yield complex(pole), without, bool(spurious[r])
 
     def _is_near(self, pole: complex, rejected: list[tuple[complex, float]]) -> bool:

@@ -19,7 +19,7 @@ from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, changes_of, normalised_basis, regressors, row_weights
 from workbench.identification.input_output.time_variance import slopes_in_time
 from workbench.identification.signal.modal_estimates import time_derivatives
-from workbench.identification.signal.searches import Budget
+from workbench.identification.signal.searches import TimeLimit
 from workbench.records.band_limited import derivative_of, spaced
 from workbench.records.record import Record
 
@@ -79,7 +79,7 @@ def on_inputs_clock(record: Record, rate: float) -> Record:
 
 
 def on_one_clock(
-    data: KnownInputs, fit: Fit, fitted: Callable[[KnownInputs], Fit], budget: Budget
+    data: KnownInputs, fit: Fit, fitted: Callable[[KnownInputs], Fit], time_limit: TimeLimit
 ) -> tuple[KnownInputs, Fit] | None:
     """The data with the outputs resampled to the inputs' clock, and the fit to them; None where both clocks are one.
 
@@ -96,7 +96,7 @@ def on_one_clock(
         return None
     for _ in range(OUTPUT_CLOCK.rounds):
         rate += (1.0 + rate) * clock.rate
-        if abs(rate) > OUTPUT_CLOCK.most or budget.spent("search for a clock of the outputs of its own"):
+        if abs(rate) > OUTPUT_CLOCK.most or time_limit.spent("search for a clock of the outputs of its own"):
             return None
         on_one = [on_inputs_clock(record, rate) for record in data.records]
         resampled = replace(data, records=on_one, clock=rate, line_std=None)

@@ -26,7 +26,7 @@ from workbench.identification.input_output.modal_fit import (
     orthonormal,
     projected,
 )
-from workbench.identification.signal.searches import Budget
+from workbench.identification.signal.searches import TimeLimit
 from workbench.threads import at_once
 
 
@@ -57,7 +57,7 @@ def in_place_of_clusters(
     fit: Fit,
     alike: np.ndarray,
     rival_of: Callable[[Data, np.ndarray], tuple[Data, complex] | None],
-    budget: Budget,
+    time_limit: TimeLimit,
 ) -> tuple[Data, Fit] | None:
     """The measurement with the columns of changing modes, and the fit with one mode for each cluster that one replaces.
 
@@ -67,7 +67,7 @@ def in_place_of_clusters(
         alike: (n_modes, n_modes) whether two modes may be one, by their shapes.
         rival_of: the measurement with the columns of a changing mode in place of a cluster of modes, the strongest
             first, and the pole of the nearest linear mode, rad/s; None where the linear modes are likelier.
-        budget: of time.
+        time_limit: of time.
 
     Returns:
         None where linear modes are likelier everywhere.
@@ -87,7 +87,7 @@ def in_place_of_clusters(
                 yield rank, np.r_[r, others[:k]]
 
     tries = clusters(0)
-    while (two := list(islice(tries, 2))) and not budget.spent("check of modes that change"):
+    while (two := list(islice(tries, 2))) and not time_limit.spent("check of modes that change"):
         rivals = at_once(partial(rival_of, data), [cluster for _, cluster in two])
         for (rank, cluster), rival in zip(two, rivals, strict=True):
             if rival is not None:

@@ -21,7 +21,7 @@ from workbench.identification.input_output.noise_spectrum import alike
 from workbench.identification.input_output.output_clock import on_one_clock
 from workbench.identification.input_output.subspace_poles import subspace_poles
 from workbench.identification.input_output.time_variance import beside_changing
-from workbench.identification.signal.searches import SELECTION, Budget
+from workbench.identification.signal.searches import SELECTION, TimeLimit
 
 
 @dataclass(frozen=True)
@@ -45,19 +45,21 @@ def select(
     Returns:
         the data, weighted by their noise, and the modes.
     """
-    budget = options.budget
+    time_limit = options.time_limit
     start = subspace_start(data, options) if strongest is None else strongest.fit
     start = sure_modes(data, start, options, times=1.0)  # once for all searches from there
     sure = sure_modes(data, start, options)
-    on_one = on_one_clock(data, sure, lambda other: sure_modes(other, subspace_start(other, options), options), budget)
+    on_one = on_one_clock(
+        data, sure, lambda other: sure_modes(other, subspace_start(other, options), options), time_limit
+    )
     if on_one is not None:
         (data, sure), strongest = on_one, None
         start = sure
-    noise = None if budget.spent("search for noise of the inputs") else input_noise(data, sure)
+    noise = None if time_limit.spent("search for noise of the inputs") else input_noise(data, sure)
     if noise is not None:
         (data, start), strongest = with_white_noise(data, sure, noise, options), None
     if strongest is None:
-        share = replace(options, budget=budget.share(SELECTION.search_share))
+        share = replace(options, time_limit=time_limit.share(SELECTION.search_share))
         strongest = select_strongest(data, share, start)
     data = data.with_distorted(strongest.distorted)
     uncorrelated = data.apart(strongest.fit)
@@ -68,18 +70,18 @@ def select(
         again = select_strongest(uncorrelated, options, strongest.fit)
         uncorrelated, selected = _select_weighted(uncorrelated, again, options)
         further = uncorrelated.apart(selected.fit)
-        if further is None or budget.spent("search in outputs of uncorrelated noise"):
+        if further is None or time_limit.spent("search in outputs of uncorrelated noise"):
             break
         uncorrelated, strongest = further, selected
     data = replace(data, line_std=None, beside=uncorrelated.beside, changing=uncorrelated.changing)
-    fit = settled(data, projected(data, selected.fit.poles, selected.fit.participation), budget=budget)
-    return reweighted(data, selected, fit, budget)
+    fit = settled(data, projected(data, selected.fit.poles, selected.fit.participation), time_limit=time_limit)
+    return reweighted(data, selected, fit, time_limit)
 
 
-def reweighted(data: KnownInputs, selected: Selected, fit: Fit, budget: Budget) -> tuple[KnownInputs, Selected]:
+def reweighted(data: KnownInputs, selected: Selected, fit: Fit, time_limit: TimeLimit) -> tuple[KnownInputs, Selected]:
     """The data weighted by the noise spectrum of a fit, and the modes refitted to them, by rising frequency."""
     data = replace(data, line_std=data.noise_spectrum(fit))
-    return data, selected.refitted(settled(data, only(data, fit, np.argsort(np.abs(fit.poles))), budget=budget))
+    return data, selected.refitted(settled(data, only(data, fit, np.argsort(np.abs(fit.poles))), time_limit=time_limit))
 
 
 def subspace_start(data: KnownInputs, options: SelectionOptions) -> Fit:
@@ -101,7 +103,7 @@ def select_strongest(data: KnownInputs, options: SelectionOptions, start: Fit | 
     few, is_tested = _few_of(options, fit.poles.size), False
     while True:
         found = select_modes(data, few, fit, is_tested=is_tested)
-        selected = only_predictive(data, found, options.budget)
+        selected = only_predictive(data, found, options.time_limit)
         fit, is_tested = selected.fit, selected.fit is found.fit
         if fit.poles.size < few.max_modes or few.max_modes == options.max_modes:
             return selected
@@ -116,12 +118,12 @@ def _few_of(options: SelectionOptions, fewest: int) -> SelectionOptions:
     return replace(options, max_modes=min(max(DRIVEN_SELECTION.strongest, fewest), options.max_modes))
 
 
-def only_predictive(data: KnownInputs, selected: Selected, budget: Budget) -> Selected:
+def only_predictive(data: KnownInputs, selected: Selected, time_limit: TimeLimit) -> Selected:
     """The selected modes without those that make the prediction of held-out data worse.
 
     These are marked as distorted: no further mode is searched near them.
     """
-    fit, distorted = without_unpredictive(data, selected.fit, selected.statistic, budget)
+    fit, distorted = without_unpredictive(data, selected.fit, selected.statistic, time_limit)
     return replace(selected.refitted(fit), distorted=(*data.distorted, *distorted))
 
 
@@ -132,15 +134,15 @@ def _select_weighted(data: KnownInputs, strongest: Selected, options: SelectionO
     underestimated and the mode appears significant. The noise is therefore estimated again without all doubtful modes;
     they stay if modes and noise together are less likely without them.
     """
-    budget, check = options.budget, "check of doubtful modes"
+    time_limit, check = options.time_limit, "check of doubtful modes"
     data, selected = _alternate_with_noise(data, strongest, _few_of(options, strongest.fit.poles.size), options)
     doubtful = (selected.statistic < SELECTION.weak * selected.limit) | ~_are_oscillatory(data, selected)
-    if data.line_std is None or not doubtful.any() or budget.spent(check):
+    if data.line_std is None or not doubtful.any() or time_limit.spent(check):
         return data, selected
-    sure = settled(data, only(data, selected.fit, ~doubtful), budget=budget)
+    sure = settled(data, only(data, selected.fit, ~doubtful), time_limit=time_limit)
     other = replace(data, line_std=data.noise_spectrum(sure))
     other, fewer = _alternate_with_noise(other, select_modes(other, options, sure), options, options)
-    if budget.spent(check):
+    if time_limit.spent(check):
         return data, selected
     threshold = selected.limit * (selected.fit.poles.size - fewer.fit.poles.size)
     less_oscillatory = (~_are_oscillatory(data, selected)).sum() > (~_are_oscillatory(other, fewer)).sum()
@@ -165,18 +167,18 @@ def _alternate_with_noise(
         first_options: those by which `selected` was selected.
         options: those of the selections that follow.
     """
-    budget, estimation = options.budget, "estimation of the noise spectrum"
+    time_limit, estimation = options.time_limit, "estimation of the noise spectrum"
     linear: list[np.ndarray] = []
     for _ in range(DRIVEN_SELECTION.noise_rounds):
         data, selected = _with_changing(data, selected, first_options, linear)
         line_std = data.noise_spectrum(selected.fit)
         may_be_more = selected.full and first_options.max_modes < options.max_modes
-        if (alike(line_std, data.line_std) and not may_be_more) or budget.spent(estimation):
+        if (alike(line_std, data.line_std) and not may_be_more) or time_limit.spent(estimation):
             break
         weighted = replace(data.with_distorted(selected.distorted), line_std=line_std)
-        reselected = only_predictive(weighted, select_modes(weighted, options, selected.fit), budget)
+        reselected = only_predictive(weighted, select_modes(weighted, options, selected.fit), time_limit)
         # A search that the time limit ended early does not replace the one before.
-        if budget.spent(estimation) and reselected.fit.poles.size < selected.fit.poles.size:
+        if time_limit.spent(estimation) and reselected.fit.poles.size < selected.fit.poles.size:
             break
         data, selected, first_options = weighted, reselected, options
     return data, selected
@@ -193,7 +195,7 @@ def _with_changing(
     # With one input and output both models were compared before.
     compared = data.values.shape[1] * data.n_inputs == 1
     for _ in range(DRIVEN_SELECTION.noise_rounds):
-        changing = beside_changing(data, selected.fit, selected.limit, options.budget, linear)
+        changing = beside_changing(data, selected.fit, selected.limit, options.time_limit, linear)
         if changing is None:
             break
         fewer = select_modes(changing[0], options, changing[1])

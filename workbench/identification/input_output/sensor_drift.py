@@ -65,8 +65,8 @@ def beside_drift(data: KnownInputs, options: SelectionOptions) -> tuple[KnownInp
 
 def _strongest(data: KnownInputs, options: SelectionOptions) -> tuple[Selected, bool]:
     """The strongest modes, and whether the time for their search was up."""
-    budget = options.budget.aside(DRIFT.share)
-    return select_strongest(data, replace(options, budget=budget)), bool(budget.unfinished)
+    time_limit = options.time_limit.aside(DRIFT.share)
+    return select_strongest(data, replace(options, time_limit=time_limit)), bool(time_limit.unfinished)
 
 
 def _range_of_drift(data: KnownInputs, fit: Fit) -> Floats:

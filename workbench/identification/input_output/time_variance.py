@@ -37,7 +37,7 @@ from workbench.identification.input_output.modal_fit import (
     settled,
 )
 from workbench.identification.input_output.rivals import in_place_of_clusters, orthonormal_basis
-from workbench.identification.signal.searches import SELECTION, Budget
+from workbench.identification.signal.searches import SELECTION, TimeLimit
 from workbench.structure.modes import mac
 from workbench.structure.printed import mode_text
 
@@ -110,7 +110,7 @@ def slopes_in_time(data: KnownInputs, fit: Fit, x: Floats) -> tuple[Floats, Floa
     return real, imaginary
 
 
-def joined(data: KnownInputs, fit: Fit, budget: Budget) -> Fit:
+def joined(data: KnownInputs, fit: Fit, time_limit: TimeLimit) -> Fit:
     """The fit with one mode in place of two alike, where a change of the one within the record explains the other.
 
     With one input and one output the rival models were compared already (`beside_changing`).
@@ -118,19 +118,19 @@ def joined(data: KnownInputs, fit: Fit, budget: Budget) -> Fit:
     if fit.noise.size * data.n_inputs == 1:
         return fit
     for pair in _pairs_alike(fit):
-        if budget.spent(CHANGE_CHECK):
+        if time_limit.spent(CHANGE_CHECK):
             break
         weak, strong = sorted(pair, key=lambda r: statistic_of(fit, r))
-        one = settled(data, only(data, fit, np.delete(np.arange(fit.poles.size), weak)), budget=budget)
+        one = settled(data, only(data, fit, np.delete(np.arange(fit.poles.size), weak)), time_limit=time_limit)
         change, at = changes_in_time(data, one), strong - (weak < strong)
         statistic = (change.frequency[at] / change.deviation[at]) ** 2
         if change.sure[at] and statistic > CHANGING.instead * added_misfit(one, fit, one.noise):
-            return joined(data, one, budget)
+            return joined(data, one, time_limit)
     return fit
 
 
 def beside_changing(
-    data: KnownInputs, fit: Fit, limit: float, budget: Budget, linear: list[np.ndarray]
+    data: KnownInputs, fit: Fit, limit: float, time_limit: TimeLimit, linear: list[np.ndarray]
 ) -> tuple[KnownInputs, Fit] | None:
     """The records with the columns of changing modes, and the fit without the modes that modelled their change.
 
@@ -141,7 +141,7 @@ def beside_changing(
         linear: see `in_place_of`.
     """
     if fit.noise.size * data.n_inputs == 1:
-        return _beside_rivals(data, fit, limit, budget, linear)
+        return _beside_rivals(data, fit, limit, time_limit, linear)
     strength = statistic_of_each(fit)
     participation = fit.participation[:, : data.n_inputs].T
     alike = mac(fit.amplitudes, fit.amplitudes) * mac(participation, participation) > CHANGING.alike
@@ -152,10 +152,10 @@ def beside_changing(
         weak = strength < CHANGING.faint * strength[r]
         close = np.abs(fit.poles.imag - fit.poles.imag[r]) < CHANGING.reach * np.abs(fit.poles.imag[r])
         others = np.flatnonzero(weak & close & alike[r] & ~removed)
-        if removed[r] or not others.size or budget.spent(CHANGE_CHECK):
+        if removed[r] or not others.size or time_limit.spent(CHANGE_CHECK):
             continue
         kept = np.delete(np.arange(fit.poles.size), others)
-        one = settled(data, only(data, fit, kept), SELECTION.few_steps, budget)
+        one = settled(data, only(data, fit, kept), SELECTION.few_steps, time_limit)
         at = int(np.searchsorted(kept, r))
         motion = _motion(data, one.poles[at], one.participation[at])
         decrease = added_misfit(one, fit, fit.noise)
@@ -171,7 +171,7 @@ def beside_changing(
 
 
 def _beside_rivals(
-    data: KnownInputs, fit: Fit, limit: float, budget: Budget, linear: list[np.ndarray]
+    data: KnownInputs, fit: Fit, limit: float, time_limit: TimeLimit, linear: list[np.ndarray]
 ) -> tuple[KnownInputs, Fit] | None:
     """`beside_changing` for one input and one output, where shapes tell nothing: the likelier rival model is kept."""
     omega = fit.poles.imag
@@ -181,8 +181,8 @@ def _beside_rivals(
         data,
         fit,
         close,
-        lambda data, cluster: in_place_of(data, fit, cluster, rows_of(data), limit, budget, linear),
-        budget,
+        lambda data, cluster: in_place_of(data, fit, cluster, rows_of(data), limit, time_limit, linear),
+        time_limit,
     )
 
 

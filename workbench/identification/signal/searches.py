@@ -75,7 +75,7 @@ BY_CHANCE = (1.0 - SELECTION.same_shape) ** 2
 Progress = Callable[[str, float], None]
 
 
-class Budget(Deadline):
+class TimeLimit(Deadline):
     """A limit of processor time for an identification, and the searches that it ended early.
 
     Attributes:
@@ -97,24 +97,24 @@ class Budget(Deadline):
         self.unfinished.setdefault(search, (self._end - self._begun) / (self._whole - self._begun))
         return True
 
-    def share(self, share: float) -> "Budget":
-        """A budget of a share of the time left, in (0, 1]; both record unfinished searches together."""
-        part = Budget(None if self.seconds is None else share * max(self._end - self._now, 1e-3), self.progress)
+    def share(self, share: float) -> "TimeLimit":
+        """A limit of a share of the time left, in (0, 1]; both record unfinished searches together."""
+        part = TimeLimit(None if self.seconds is None else share * max(self._end - self._now, 1e-3), self.progress)
         part.unfinished, part._begun, part._whole = self.unfinished, self._begun, self._whole
         return part
 
-    def aside(self, share: float) -> "Budget":
-        """A budget of a share of the time left for a preliminary search; its unfinished searches are not recorded."""
-        return Budget(self.share(share).seconds)
+    def aside(self, share: float) -> "TimeLimit":
+        """A limit of a share of the time left for a preliminary search; its unfinished searches are not recorded."""
+        return TimeLimit(self.share(share).seconds)
 
-    def apart(self, share: float) -> "Budget":
-        """A budget of a share of the time left for one of several tasks; `counted` records its unfinished searches."""
+    def apart(self, share: float) -> "TimeLimit":
+        """A limit of a share of the time left for one of several tasks; `counted` records its unfinished searches."""
         part = self.share(share)
         part.unfinished = {}
         return part
 
-    def counted(self, part: "Budget") -> None:
-        """Record the unfinished searches of a budget from `apart`."""
+    def counted(self, part: "TimeLimit") -> None:
+        """Record the unfinished searches of a limit from `apart`."""
         for search, share in part.unfinished.items():
             self.unfinished.setdefault(search, share)
 
@@ -205,7 +205,7 @@ def minimise(
     *,
     most_steps: int,
     round_off: float = 0.0,
-    budget: Budget | None = None,
+    time_limit: TimeLimit | None = None,
     is_vain: Callable[[State], bool] = lambda state: False,
 ) -> Minimum[State]:
     """The local minimum of a problem next to `start`.
@@ -215,7 +215,7 @@ def minimise(
         start: admissible.
         most_steps: largest number of steps.
         round_off: of the cost; a step that raises it by no more is accepted.
-        budget: time limit; none unless given.
+        time_limit: of processor time; none unless given.
         is_vain: whether a state ends the search, since what follows from it is of no use.
     """
     state, cost, damping, small = start, problem.cost(start), DAMPING.first, False
@@ -241,7 +241,7 @@ def minimise(
         damping = max(DAMPING.lowered * damping, DAMPING.least)
         if small or damping > DAMPING.stuck:
             return Minimum(state, cost, small, taken)
-        if is_vain(state) or (budget is not None and budget.spent("refinement")):
+        if is_vain(state) or (time_limit is not None and time_limit.spent("refinement")):
             return Minimum(state, cost, False, taken)
     return Minimum(state, cost, False, most_steps)
 
@@ -271,7 +271,7 @@ class Once:
 
 
 class Selection(Protocol[Model, Candidate]):
-    """A measurement for `Stepwise`; a model is a fitted set of modes, a candidate a mode that may enter it."""
+    """A measurement for `OrderSelection`; a model is a fitted set of modes, a candidate a mode that may enter it."""
 
     def n_modes(self, model: Model) -> int: ...
 
@@ -307,8 +307,8 @@ class Selection(Protocol[Model, Candidate]):
 
 
 @dataclass
-class Stepwise(Generic[Model, Candidate]):
-    """Stepwise selection of modes, forward and backward.
+class OrderSelection(Generic[Model, Candidate]):
+    """OrderSelection selection of modes, forward and backward.
 
     Attributes:
         problem: see `Selection`.
@@ -316,8 +316,8 @@ class Stepwise(Generic[Model, Candidate]):
         most_weak: number of consecutive candidates below the threshold at which the forward search ends.
         most_splits: number of candidates that split a mode at which it ends; None to count these as weak.
         forgets: whether a rejected candidate may be tried again once another mode has entered.
-        budget: time limit.
-        alone: whether the whole budget is for this selection.
+        time_limit: of processor time.
+        alone: whether the whole time is for this selection.
         rejected: poles tried and rejected, with their gain.
         full: whether the selection stopped at `max_modes`.
         cut_short: whether the time limit ended the last forward search.
@@ -328,7 +328,7 @@ class Stepwise(Generic[Model, Candidate]):
     most_weak: float
     most_splits: int | None
     forgets: bool
-    budget: Budget = field(default_factory=Budget)
+    time_limit: TimeLimit = field(default_factory=TimeLimit)
     alone: bool = False
     rejected: list[tuple[complex, float]] = field(default_factory=list)
     full: bool = False
@@ -346,7 +346,7 @@ class Stepwise(Generic[Model, Candidate]):
             model = self.backward(self.problem.settled(grown))
             left = self.problem.n_modes(model)
             # The forward search had a share of the time only; it goes on with what the backward search left.
-            if self.cut_short and self.alone and not self.budget.is_past:
+            if self.cut_short and self.alone and not self.time_limit.is_past:
                 continue
             # Without a memory of rejected candidates the next round would repeat this one.
             if left == most or (self.forgets and left <= before):
@@ -356,9 +356,9 @@ class Stepwise(Generic[Model, Candidate]):
     def forward(self, model: Model) -> Model:
         """The model with every candidate of significant gain."""
         weak = splits = 0
-        own_budget = self.budget.share(SELECTION.forward_share)
+        own_budget = self.time_limit.share(SELECTION.forward_share)
         if self.cut_short:
-            self.budget.unfinished.pop(FURTHER, None)
+            self.time_limit.unfinished.pop(FURTHER, None)
             self.cut_short = False
         if self.forgets:
             self.rejected.clear()
@@ -391,17 +391,17 @@ class Stepwise(Generic[Model, Candidate]):
             self.rejected.append((complex(pole), gain))
         return model
 
-    def _ends(self, own_budget: Budget) -> bool:
+    def _ends(self, own_budget: TimeLimit) -> bool:
         """Whether the time of the forward search is up; sets `cut_short`."""
         self.cut_short = own_budget.spent(FURTHER)
         return self.cut_short
 
     def backward(self, model: Model) -> Model:
         """The model without modes of insignificant gain; the weakest goes first."""
-        while self.problem.n_modes(model) and not self.budget.spent("check of each mode"):
+        while self.problem.n_modes(model) and not self.time_limit.spent("check of each mode"):
             weakest: tuple[float, complex, Model] | None = None
             for pole, without, certainly in self.problem.suspects(model):
-                if self.budget.spent("check of each mode"):
+                if self.time_limit.spent("check of each mode"):
                     return model
                 gain = self.problem.gain(without, model)
                 out = certainly or gain < self.problem.threshold(model, pole)
