@@ -214,10 +214,10 @@ def with_delay_as_error(search: Search, errors: Effect, late: Effect) -> Effect:
 def with_wrong_ports(search: Search, step: JointFit) -> JointFit:
     """The step with errors of gain and place as effects, each too large for a careful laboratory and outlying."""
     for _ in range(ERRORS.wrong_ports):
-        suspects = sorted(_suspects(search, step), key=lambda s: -s.size)[:1]
-        if not suspects:
+        suspect = max(_suspects(search, step), key=lambda s: s.size, default=None)
+        if suspect is None:
             break
-        ((effect, _),) = suspects
+        effect = suspect.effect
         others = [e for e in step.effects if (e.kind, e.target) != (effect.kind, effect.target)]
         found = fit_from_zero(search, (*others, effect))  # other nominal errors have absorbed part of it
         group, limit = ("gain", ERRORS.most_gain) if "gain" in effect.values else ("place", ERRORS.most_moved)
@@ -245,7 +245,7 @@ def _suspects(search: Search, step: JointFit) -> Iterator[_Suspect]:
     for of_gain, of_place, ports in sides:
         for nominal, port in ports:
             known = named.get((of_gain, nominal.name))
-            gain = port.gain / nominal.gain
+            gain = port.gain / nominal.gain if nominal.gain else 1.0
             size = abs(float(np.log(gain))) / ERRORS.most_gain
             if of_gain in search.catalogue and size > ERRORS.suspect:
                 gain *= 1.0 if known is None else known.values["gain"]
