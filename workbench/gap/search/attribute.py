@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 
@@ -23,13 +24,20 @@ from workbench.gap.prediction.noise import LEAST_LOGGED, logging_noise, shows_in
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import Workers
-from workbench.gap.search.errors_as_effects import may_be_small_error, uniform_as_nominal_errors, with_delay_as_error
+from workbench.gap.search.errors_as_effects import (
+    UNIFORM,
+    is_linear_structural,
+    may_be_small_error,
+    uniform_as_nominal_errors,
+    with_delay_as_error,
+)
 from workbench.gap.search.finish import widened
 from workbench.gap.search.fit import Chord, Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.jointly import fit_jointly, with_all_errors
+from workbench.gap.search.screening import on_whole_records, one_more
 from workbench.gap.search.search import Search, best_of_each, best_of_each_kind, most_informative
-from workbench.gap.search.settings import ATTRIBUTION, SELECTION
+from workbench.gap.search.settings import ATTRIBUTION, PAIRS, SELECTION
 from workbench.gap.search.stages import Stages
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
@@ -229,7 +237,7 @@ def attribute(
     final_search = own_search or search
     best = uniform_as_nominal_errors(search, best, alone=random is not None)
     if outcome == "explained" and random is None:
-        best = widened(final_search, best)
+        best = _with_one_for_two(final_search, widened(final_search, best))
     if seen:
         best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))
         outcome = "explained" if outcome == "none" else outcome
@@ -275,6 +283,27 @@ def attribute(
         is_cut=is_cut,
         missing=missing,
     )
+
+
+def _with_one_for_two(search: Search, best: Fit) -> Fit:
+    """The fit with two linear effects of the structure replaced by one, if that explains the records as well.
+
+    A loss of stiffness and an error of all stiffness approximate a spring to ground.
+    """
+    kinds = [kind for kind in search.catalogue if is_linear_structural(kind) or kind in UNIFORM]
+    linear = [effect for effect in best.effects if effect.kind in kinds]
+    if any(effect.kind is NOMINAL_ERRORS for effect in best.effects):
+        return best
+    narrow, data = replace(search, catalogue=tuple(kinds)), search.data.finely(SELECTION.fine)
+    for two in combinations(linear, 2):
+        rest = tuple(effect for effect in best.effects if effect not in two)
+        ahead = one_more(narrow, rest, search.evidence_with(rest))
+        here = cost_of(search.rig, best.effects, data)
+        for fewer in on_whole_records(narrow, ahead, PAIRS.more):
+            extra = max(best.n_parameters - fewer.n_parameters, 0)
+            if search.explains(fewer) and not search.tells_apart(here, fewer.cost, extra):
+                return fewer
+    return best
 
 
 def _refitted(search: Search, effects: Sequence[Effect], data: FitData) -> Fit:

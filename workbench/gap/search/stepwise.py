@@ -1,12 +1,12 @@
 """Stepwise selection of effects, each fitted jointly with small errors of the nominal model."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect, apply_all, contained, key_of, more_general_sets
+from workbench.gap.effects.effect import Effect, Kind, apply_all, contained, key_of, more_general_sets
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, in_group, nominal_errors
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.noise import LEAST_LOGGED
@@ -47,6 +47,7 @@ from workbench.gap.search.search import Decision, Search, apart, best_of_each_ki
 from workbench.gap.search.settings import FINISH, INPUTS, PLAIN, SEARCH, SELECTION, STEPWISE
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
+from workbench.structure.domain import Where
 
 
 class Stepwise:
@@ -155,7 +156,8 @@ class Stepwise:
         fresh = self.search.side_by_side(fit_from_zero, [effects for effects in sets if key_of(effects) not in keys])
         found = [s for s in (*self.known, *fresh) if not may_be_port_errors(self.search, s.effects)]
         # one step ahead without nominal errors, the true law may come after errors of gain and place
-        another = self._with_another_law(min(found, key=lambda s: s.fit.cost)) if found else None
+        nearest = min(found, key=lambda s: s.fit.cost, default=None)
+        another = nearest and (self._with_another_law(nearest) or self._with_law_elsewhere(nearest))
         found += [] if another is None else [another]
         best = sorted(found, key=lambda s: s.fit.cost)
         if not best or (self.has_plausible_errors and not self.search.by_mode):
@@ -392,7 +394,7 @@ class Stepwise:
             if self.search.is_over:
                 break
             before = self.last
-            step = self._with_another_law(before)
+            step = self._with_another_law(before) or self._with_law_elsewhere(before)
             moved = self._at_another_place(before) if step is None and not is_moved else None
             step, is_moved = step or moved, moved is not None
             if step is None and len(before.effects) < most:
@@ -417,31 +419,52 @@ class Stepwise:
         the errors are nearly known, the laws compare. More general laws, of which this one is a limiting case, compete
         with two effects (`_with_one_more`).
         """
-        if len(step.effects) != 1 or step.explains:
+        effect = _law_of(step)
+        if effect is None or step.explains:
             return None
-        (effect,), search = step.effects, self.search
-        if not effect.kind.nonlinear or effect.kind.path in PORTS:
+        domain = self.search.rig.modes.domain
+        laws = tuple(kind for kind in self.search.catalogue if kind.nonlinear and kind is not effect.kind)
+        return self._exchanged(step, laws, effect.at, lambda e: effect.at is None or not apart(e, effect, domain))
+
+    def _with_law_elsewhere(self, step: JointFit) -> JointFit | None:
+        """The step with its one nonlinear law at another place, if that is likelier; tried above the stated noise.
+
+        A law at a wrong place may leave no more than noise that is a little louder than stated.
+        """
+        effect = _law_of(step)
+        if effect is None or effect.at is None or not step.explains or self.search.explains(step.fit):
             return None
-        search.progress("another law at the same place", 0.6)
-        laws = tuple(kind for kind in search.catalogue if kind.nonlinear and kind is not effect.kind)
-        with_errors = replace(search.with_nominal_errors(step.errors), catalogue=laws)
+        domain = self.search.rig.modes.domain
+        return self._exchanged(step, (effect.kind,), None, lambda e: apart(e, effect, domain))
+
+    def _exchanged(
+        self, step: JointFit, kinds: tuple[Kind, ...], at: Where | None, is_tried: Callable[[Effect], bool]
+    ) -> JointFit | None:
+        """The step with its one law exchanged for a likelier one at a point, beside its errors, or None.
+
+        Args:
+            step: with one effect.
+            kinds: of the effects that are tried.
+            at: place of the missing force; None if it is not known.
+            is_tried: whether an effect of these kinds is among them.
+        """
+        search = self.search
+        search.progress("another law, or the same at other places", 0.6)
+        with_errors = replace(search.with_nominal_errors(step.errors), catalogue=kinds)
         evidence = Evidence.of(
             apply_all(search.rig, (step.errors,)), search.data, workers=search.workers, absorbed=True
         )
-        evidence = evidence if effect.at is None else evidence.of_force_at(effect.at)
-        key, domain = key_of(step.effects), search.rig.modes.domain
-        there = [
+        ahead = one_more(with_errors, (), evidence if at is None else evidence.of_force_at(at))
+        key = key_of(step.effects)
+        others = [
             f
-            for f in one_more(with_errors, (), evidence)
-            if f.effects[0].at is not None
-            and (effect.at is None or not apart(f.effects[0], effect, domain))
-            and key not in contained(f.effects, search.rig)
+            for f in ahead
+            if f.effects[0].at is not None and is_tried(f.effects[0]) and key not in contained(f.effects, search.rig)
         ]
-        present = fitted_ahead(with_errors, [step.effects])
-        cost_limit = min((f.cost for f in present), default=np.inf)
-        likeliest = [f for f in best_of_each_kind(there) if f.cost < cost_limit][: STEPWISE.finalists]
-        others = search.workers.map(lambda f: fit_jointly(search, f.effects, step.errors, rounds=2), likeliest)
-        best, *rest = sorted((step, *others), key=partial(loss, search))
+        cost_limit = min((f.cost for f in fitted_ahead(with_errors, [step.effects])), default=np.inf)
+        likeliest = [f for f in best_of_each_kind(others) if f.cost < cost_limit][: STEPWISE.finalists]
+        fitted = search.workers.map(lambda f: fit_jointly(search, f.effects, step.errors, rounds=2), likeliest)
+        best, *rest = sorted((step, *fitted), key=partial(loss, search))
         return replace(best, others=(best, *rest)) if best is not step and self._is_accepted(best, step) else None
 
     def _at_another_place(self, step: JointFit) -> JointFit | None:
@@ -724,6 +747,12 @@ class Stepwise:
         others = [s for s in chosen.others if key_of(s.effects) != key]
         # a rival may have errors at the very bound of what is plausible
         return [chosen, *(s for s in others if s.explains or is_as_good(s, chosen, self._gap, share=1.0))]
+
+
+def _law_of(step: JointFit) -> Effect | None:
+    """The nonlinear law of the structure that is the one effect of a step, or None."""
+    effect = step.effects[0] if len(step.effects) == 1 else None
+    return effect if effect is not None and effect.kind.nonlinear and effect.kind.path not in PORTS else None
 
 
 def _cost_ahead(search: Search, rig: Rig) -> float:
