@@ -249,6 +249,8 @@ def test_noise_is_found_beside_resonances_and_in_colours(memory):
         (20381213, "late", 1.0, ("actuator_misplacement",)),  # errors of places and stiffness stood for it
         (20381223, "input", 2.0, ("clearance",)),  # a loss of stiffness of 1.3 +- 0.7 % beside it
         (20381247, "gain", 1.0, ("bouc_wen",)),  # unknown: it does not show one step ahead
+        # the spring told as a loss of stiffness and an error of all stiffness
+        (20390282, "triple", 2.0, ("ground_spring", "periodic_disturbance", "point_mass")),
         (20390256, "late", 0.5, ("bouc_wen",)),  # at a wrong place, with louder noise for the rest
         (94290030, "place", 2.0, ()),  # told as one sensor that is out of its place, no farther than any other
     ],
