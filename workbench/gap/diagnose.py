@@ -230,13 +230,13 @@ def _validated(rig: Rig, found: Attribution, held_out: Sequence[Record], settle:
     effects = found.best.effects
     if found.outcome in ("part", "unknown") and not _unpredictable(found):
         with_none = _residual_power(rig, found.seen, held_out, settle)
-        kept = tuple(e for e in effects if e in found.seen or e.stands_out(rig))
+        kept = tuple(e for e in effects if e.is_in_readings or e.stands_out(rig))
         while len(kept) > len(found.seen) and _residual_power(rig, kept, held_out, settle) > with_none:
-            fewer = [tuple(e for e in kept if e is not one) for one in kept if one not in found.seen]
+            fewer = [tuple(e for e in kept if e is not one) for one in kept if not one.is_in_readings]
             kept = min(fewer, key=lambda rest: _residual_power(rig, rest, held_out, settle))
         dropped = [e for e in effects if e not in kept]
         return _validated(rig, found.without(*dropped), held_out, settle) if dropped else found
-    named = [e for e in effects if not e.kind.applied_first and e not in found.seen]
+    named = [e for e in effects if not e.kind.applied_first and not e.is_in_readings]
     if found.outcome != "explained" or len(named) < 2 or _unpredictable(found):
         return found
     after = _residual_power(rig, effects, held_out, settle)

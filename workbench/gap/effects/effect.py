@@ -361,6 +361,11 @@ class Effect:
         return self.numbers if self.kind.numbers is None else self.kind.numbers(self, rig)
 
     @property
+    def is_in_readings(self) -> bool:
+        """Whether the readings themselves show it, as those of a sensor that clips: no search adds or alters it."""
+        return self.kind.found_in == "readings"
+
+    @property
     def at(self) -> Any:
         """Its place: x, (x, y), the name of a point, or `Between` two; None if it has none."""
         return place_of(self.values)

@@ -100,7 +100,7 @@ class Attribution:
     def without(self, *effects: Effect) -> "Attribution":
         """The attribution without some effects; the others are refitted, with new intervals."""
         search = self.search
-        others = [e for e in self.best.effects if e not in effects and e not in self.seen]
+        others = [e for e in self.best.effects if e not in effects and not e.is_in_readings]
         best = _refitted(search, others, self.weighed)
         best = with_intervals(search.rig, best, self.weighed, search.workers, logged=self.logged)
         best = replace(best, effects=(*self.seen, *best.effects))
@@ -239,7 +239,7 @@ def attribute(
     if outcome == "explained" and random is None:
         best = _with_one_for_two(final_search, widened(final_search, best))
     if seen:
-        best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))
+        best = replace(best, effects=(*seen, *(e for e in best.effects if not e.is_in_readings)))
         outcome = "explained" if outcome == "none" else outcome
     best = replace(best, effects=exchanged_last(best.effects))
     identified_prior = (
@@ -261,7 +261,7 @@ def attribute(
             best = _without_small_errors(final_search, best, seen, logged)
             named = [e for e in best.effects if not e.kind.applied_first]
             # an effect without any significant parameter only shows that there is a gap
-            is_insignificant = any(not e.stands_out(search.rig) for e in named if e not in seen)
+            is_insignificant = any(not e.stands_out(search.rig) for e in named if not e.is_in_readings)
             outcome = "none" if not named else "unknown" if is_insignificant else outcome
     if noise is None:
         noise = search.noise_with(best) if random is None else search.data.noise
@@ -321,10 +321,10 @@ def _significant(search: Search, best: Fit, seen: Sequence[Effect], logged: floa
     data, rig = search.data.finely(SELECTION.fine), search.rig
 
     for effect in best.effects:
-        if effect in seen or effect.kind.applied_first:
+        if effect.is_in_readings or effect.kind.applied_first:
             continue
         is_sure = effect.stands_out(rig) and effect.is_sure(rig)
-        others = [e for e in best.effects if e is not effect and e not in seen]
+        others = [e for e in best.effects if not (e is effect or e.is_in_readings)]
         sets = [others] * (not is_sure) + [(*others, form) for form in simpler_forms(effect, rig)]
         if not sets:
             continue
@@ -346,7 +346,7 @@ def _without_small_errors(search: Search, best: Fit, seen: Sequence[Effect], log
     errors = next((e for e in best.effects if e.kind is NOMINAL_ERRORS), None)
     if errors is None:
         return best
-    named = [e for e in best.effects if e not in seen and e is not errors]
+    named = [e for e in best.effects if not (e is errors or e.is_in_readings)]
     for effect in named:
         if not may_be_small_error(effect, errors, search):
             continue
@@ -382,7 +382,7 @@ def with_identified_errors(search: Search, best: Fit, identified: IdentifiedPrio
 
     An effect that these errors make unnecessary is left out, if another remains.
     """
-    others = [effect for effect in best.effects if effect not in seen]
+    others = [effect for effect in best.effects if not effect.is_in_readings]
     if not others:
         return best
 
