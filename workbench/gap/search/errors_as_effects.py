@@ -70,6 +70,8 @@ def may_be_small_error(effect: Effect, errors: Effect, search: Search) -> bool:
         return bool(abs(np.log(smallest.values["factor"])) < dict(ERRORS.most_alone)[effect.kind.name])
     if is_linear_structural(effect.kind):
         return any(nearer[name] == neutral for name, neutral in numbers.items())
+    if smallest.values.get("gain", 1.0) <= 0.0:  # wired the wrong way round
+        return False
     is_late = effect.kind is SENSOR_DELAY and is_plausible_delay(smallest, search, errors)
     return is_late or is_plausible_error(smallest, search)
 
@@ -88,8 +90,7 @@ def delay_of(effect: Effect) -> float:
 def is_plausible_gain_or_place(effect: Effect, rig: Rig) -> bool:
     """Whether an effect is a gain error or a shift of place within the accuracy of calibration and tape measure."""
     if "gain" in effect.values:
-        gain = effect.values["gain"]
-        return bool(gain > 0.0 and abs(np.log(gain)) < ERRORS.most_gain)
+        return bool(abs(np.log(abs(effect.values["gain"]))) < ERRORS.most_gain)
     places = [a.at for a in rig.actuators if a.name == effect.target]
     places += [s.at for s in rig.sensors if s.name == effect.target]
     if effect.at is None or not places:
