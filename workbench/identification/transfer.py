@@ -250,17 +250,17 @@ def _in_bands(
         selected = _select_in_band(lines, SelectionOptions(most, options.false_alarm / n_bands, band_budget))
         return _modes_of(*selected, channels, edges, f[first:last])
 
-    time_limit, budgets, results = options.time_limit, [], []
+    time_limit, limits, results = options.time_limit, [], []
     for k in range(n_bands):
-        budgets.append(time_limit.apart(1.0 / (n_bands - k)))
-        results.append(band(k, budgets[k]))
+        limits.append(time_limit.apart(1.0 / (n_bands - k)))
+        results.append(band(k, limits[k]))
     # A band of modes that change takes many times its share of the time; other bands hardly use theirs.
-    ended = [k for k in range(n_bands) if budgets[k].unfinished]
+    ended = [k for k in range(n_bands) if limits[k].unfinished]
     for remaining, k in zip(range(len(ended), 0, -1), ended, strict=True):
         again = time_limit.apart(1.0 / remaining)
-        if (again.seconds or 0.0) > (budgets[k].seconds or 0.0):
-            results[k], budgets[k] = band(k, again), again
-        time_limit.counted(budgets[k])
+        if (again.seconds or 0.0) > (limits[k].seconds or 0.0):
+            results[k], limits[k] = band(k, again), again
+        time_limit.counted(limits[k])
     return _joined(results, channels) if n_bands > 1 else results[0]
 
 

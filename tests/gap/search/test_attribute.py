@@ -40,19 +40,24 @@ def identified(omega):
     return Rig(modes, (Actuator("F", "F"),), (Sensor("y", "y", noise_std=NOISE),))
 
 
+def searched(nominal, real, seed, *, n_samples, sample_time, rms=1.0):
+    """A search for what the record of a real rig shows under a random force."""
+    rng = np.random.default_rng(seed)
+    clean = simulate(real, rms * rng.normal(size=(1, n_samples)), sample_time=sample_time, name="test")
+    record = replace(clean, outputs=clean.outputs + NOISE * rng.normal(size=clean.outputs.shape))
+    data = FitData((record,), np.full(len(nominal.sensors), NOISE))
+    before = data.by_channel(data.residual(nominal))
+    return Search(nominal, data, data, data, CATALOGUE, lambda text, share: None, ALONE, before)
+
+
 @pytest.mark.parametrize(("added", "kinds"), [(0.0, ["sensor_gain"]), (0.2, ["point_mass", "sensor_gain"])])
 def test_a_mass_that_stood_for_an_error_of_the_identified_frequency_is_left_out(added, kinds):
     """ω² = k / (M + m): 0.3 % of the frequency is 0.6 % of the mass, and 0.2 kg is 10 %."""
     nominal = identified(OMEGA * (1.0 + DOUBT))
     mass = Effect(kind_named("point_mass"), None, {"at": "y", "mass": added})
     real = apply_all(identified(OMEGA), [GAIN, *([mass] if added else [])])
-    rng = np.random.default_rng(2)
-    clean = simulate(real, rng.normal(size=(1, 600)), sample_time=0.05, name="test")
-    record = replace(clean, outputs=clean.outputs + NOISE * rng.normal(size=clean.outputs.shape))
-    data = FitData((record,), np.array([NOISE]))
-    before = data.by_channel(data.residual(nominal))
-    search = Search(nominal, data, data, data, CATALOGUE, lambda text, share: None, ALONE, before)
-    alone = fit(nominal, (GAIN, replace(mass, values={"at": "y", "mass": added + 0.01})), data)
+    search = searched(nominal, real, 2, n_samples=600, sample_time=0.05)
+    alone = fit(nominal, (GAIN, replace(mass, values={"at": "y", "mass": added + 0.01})), search.data)
     assert alone.effects[1].values["mass"] > 0.008, "without the doubt it stands for the error"
     found = with_identified_errors(search, alone, IdentifiedPrior.of_modes(nominal), ())
     assert sorted(e.kind.name for e in found.effects if not e.kind.applied_first) == kinds
@@ -62,14 +67,9 @@ def test_friction_far_below_its_smoothing_speed_is_a_damper():
     """Of a damper of 0.3 N s/m the records tell the ratio of force and speed alone, and neither stands out."""
     nominal = identified(OMEGA)
     damper = Effect(kind_named("point_damper"), None, {"at": "y", "coefficient": 0.3})
-    rng = np.random.default_rng(4)
-    clean = simulate(damper.apply(nominal), rng.normal(size=(1, 600)), sample_time=0.05, name="test")
-    record = replace(clean, outputs=clean.outputs + NOISE * rng.normal(size=clean.outputs.shape))
-    data = FitData((record,), np.array([NOISE]))
-    before = data.by_channel(data.residual(nominal))
-    search = Search(nominal, data, data, data, CATALOGUE, lambda text, share: None, ALONE, before)
+    search = searched(nominal, damper.apply(nominal), 4, n_samples=600, sample_time=0.05)
     friction = Effect(kind_named("coulomb_friction"), None, {"at": "y", "force": 30.0, "smoothing_speed": 100.0})
-    found = with_intervals(nominal, fit(nominal, (friction,), data), data)
+    found = with_intervals(nominal, fit(nominal, (friction,), search.data), search.data)
     assert found.effects[0].kind is friction.kind and not found.effects[0].stands_out(nominal)
     (told,) = _significant(search, found, (), 0.0).effects
     assert told.kind is damper.kind
@@ -80,15 +80,10 @@ def test_friction_as_strong_in_both_directions_is_of_one_force():
     """Both forces are sure, so no standard error shows that one is enough."""
     nominal = identified(OMEGA)
     friction = Effect(kind_named("coulomb_friction"), None, {"at": "y", "force": 1.0, "smoothing_speed": 0.05})
-    rng = np.random.default_rng(6)
-    clean = simulate(friction.apply(nominal), 5.0 * rng.normal(size=(1, 600)), sample_time=0.02, name="test")
-    record = replace(clean, outputs=clean.outputs + NOISE * rng.normal(size=clean.outputs.shape))
-    data = FitData((record,), np.array([NOISE]))
-    before = data.by_channel(data.residual(nominal))
-    search = Search(nominal, data, data, data, CATALOGUE, lambda text, share: None, ALONE, before)
+    search = searched(nominal, friction.apply(nominal), 6, n_samples=600, sample_time=0.02, rms=5.0)
     values = {"at": "y", "force_forward": 1.01, "force_backward": 0.99, "smoothing_speed": 0.05}
     two_way = Effect(kind_named("two_way_friction"), None, values)
-    found = with_intervals(nominal, fit(nominal, (two_way,), data.stepped(8)), data.stepped(8))
+    found = with_intervals(nominal, fit(nominal, (two_way,), search.data.stepped(8)), search.data.stepped(8))
     assert found.effects[0].stands_out(nominal) and found.effects[0].is_sure(nominal)
     (told,) = _significant(search, found, (), 0.0).effects
     assert told.kind is friction.kind
@@ -103,14 +98,9 @@ def test_a_joint_of_hardly_any_yield_displacement_is_a_loss_of_stiffness():
     sensors = tuple(Sensor(name, name, noise_std=NOISE) for name in points.names)
     nominal, where = Rig(modes, (Actuator("F", "S2"),), sensors), Between("S2", "S1")
     loss = Effect(kind_named("ground_spring"), None, {"at": where, "stiffness": -15.0})
-    rng = np.random.default_rng(7)
-    clean = simulate(loss.apply(nominal), rng.normal(size=(1, 400)), sample_time=0.05, name="test")
-    record = replace(clean, outputs=clean.outputs + NOISE * rng.normal(size=clean.outputs.shape))
-    data = FitData((record,), np.full(2, NOISE))
-    before = data.by_channel(data.residual(nominal))
-    search = Search(nominal, data, data, data, CATALOGUE, lambda text, share: None, ALONE, before)
+    search = searched(nominal, loss.apply(nominal), 7, n_samples=400, sample_time=0.05)
     joint = Effect(kind_named("joint_slip"), None, {"at": where, "stiffness": 15.0, "yield_displacement": 1e-7})
-    found = with_intervals(nominal, fit(nominal, (joint,), data.stepped(8)), data.stepped(8))
+    found = with_intervals(nominal, fit(nominal, (joint,), search.data.stepped(8)), search.data.stepped(8))
     assert found.effects[0].stands_out(nominal) and not found.effects[0].is_sure(nominal)
     (told,) = _significant(search, found, (), 0.0).effects
     assert told.kind is loss.kind
@@ -127,13 +117,8 @@ def test_a_speed_that_the_records_do_not_tell_from_none_is_not_stated(speed, sta
         {"at": "y", "force": 1.0, "smoothing_speed": speed},
         {"force": 0.1, "smoothing_speed": 0.04 * speed},
     )
-    rng = np.random.default_rng(5)
-    clean = simulate(friction.apply(nominal), 5.0 * rng.normal(size=(1, 600)), sample_time=0.02, name="test")
-    record = replace(clean, outputs=clean.outputs + NOISE * rng.normal(size=clean.outputs.shape))
-    data = FitData((record,), np.array([NOISE]))
-    before = data.by_channel(data.residual(nominal))
-    search = Search(nominal, data, data, data, CATALOGUE, lambda text, share: None, ALONE, before)
-    (told,) = _without_negligible_parameters(search, fit(nominal, (friction,), data)).effects
+    search = searched(nominal, friction.apply(nominal), 5, n_samples=600, sample_time=0.02, rms=5.0)
+    (told,) = _without_negligible_parameters(search, fit(nominal, (friction,), search.data)).effects
     assert ("smoothing_speed" in told.stated(nominal)) == stated
 
 

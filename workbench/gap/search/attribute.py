@@ -25,8 +25,6 @@ from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import Workers
 from workbench.gap.search.errors_as_effects import (
-    UNIFORM,
-    is_linear_structural,
     may_be_small_error,
     uniform_as_nominal_errors,
     with_delay_as_error,
@@ -290,15 +288,15 @@ def _with_one_for_two(search: Search, best: Fit) -> Fit:
 
     A loss of stiffness and an error of all stiffness approximate a spring to ground.
     """
-    kinds = [kind for kind in search.catalogue if is_linear_structural(kind) or kind in UNIFORM]
+    kinds = tuple(kind for kind in search.catalogue if kind.path == "structure" and not kind.nonlinear)
     linear = [effect for effect in best.effects if effect.kind in kinds]
-    if any(effect.kind is NOMINAL_ERRORS for effect in best.effects):
+    if len(linear) < 2 or any(effect.kind is NOMINAL_ERRORS for effect in best.effects):
         return best
-    narrow, data = replace(search, catalogue=tuple(kinds)), search.data.finely(SELECTION.fine)
+    narrow = replace(search, catalogue=kinds)
+    here = cost_of(search.rig, best.effects, search.data.finely(SELECTION.fine))
     for two in combinations(linear, 2):
         rest = tuple(effect for effect in best.effects if effect not in two)
         ahead = one_more(narrow, rest, search.evidence_with(rest))
-        here = cost_of(search.rig, best.effects, data)
         for fewer in on_whole_records(narrow, ahead, PAIRS.more):
             extra = max(best.n_parameters - fewer.n_parameters, 0)
             if search.explains(fewer) and not search.tells_apart(here, fewer.cost, extra):

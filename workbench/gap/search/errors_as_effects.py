@@ -61,9 +61,9 @@ def may_be_small_error(effect: Effect, errors: Effect, search: Search) -> bool:
     """
     numbers = {p.name: p.neutral for p in effect.parameters(search.rig) if p.neutral is not None}
     reach = {name: ERRORS.wide * effect.deviations.get(name, 0.0) for name in numbers}
-    off = {name: effect.values[name] - neutral for name, neutral in numbers.items()}
     nearer = {
-        name: neutral + np.sign(off[name]) * max(abs(off[name]) - reach[name], 0.0) for name, neutral in numbers.items()
+        name: float(np.clip(neutral, effect.values[name] - reach[name], effect.values[name] + reach[name]))
+        for name, neutral in numbers.items()
     }
     smallest = replace(effect, values={**effect.values, **nearer})
     if effect.kind in UNIFORM:

@@ -45,7 +45,6 @@ from workbench.gap.search.plain import few_with_uniform_errors, in_place_of_nomi
 from workbench.gap.search.screening import fitted_ahead, one_more
 from workbench.gap.search.search import Decision, Search, apart, best_of_each_kind, most_informative
 from workbench.gap.search.settings import FINISH, INPUTS, PLAIN, SEARCH, SELECTION, STEPWISE
-from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
 from workbench.structure.domain import Where
 
@@ -527,13 +526,13 @@ class Stepwise:
         search.progress("another effect, with small errors of the model", 0.5 + 0.1 * len(step.effects))
         # the residual beyond nominal errors fitted to whole records is evidence of a missing effect
         with_errors = search.with_nominal_errors(step.errors)
-        rig = apply_all(search.rig, step.fit.effects)
-        cost = _cost_ahead(with_errors, rig)
+        cost = cost_of(search.rig, step.fit.effects, with_errors.ahead)
         for loose in SELECTION.continuation[1:]:  # what grows slowly hides in the noise one step ahead
             if cost > 1.0 + STEPWISE.no_gap or step.explains:
                 break
             with_errors = replace(with_errors, loose=loose)
-            cost = _cost_ahead(with_errors, rig)
+            cost = cost_of(search.rig, step.fit.effects, with_errors.ahead)
+        rig = apply_all(search.rig, step.fit.effects)
         evidence = Evidence.of(rig, search.data, workers=search.workers, absorbed=True)
         ahead = one_more(with_errors, step.effects, evidence)
         if not ahead or ahead[0].cost > (1.0 - STEPWISE.ahead) * cost:
@@ -753,12 +752,6 @@ def _law_of(step: JointFit) -> Effect | None:
     """The nonlinear law of the structure that is the one effect of a step, or None."""
     effect = step.effects[0] if len(step.effects) == 1 else None
     return effect if effect is not None and effect.kind.nonlinear and effect.kind.path not in PORTS else None
-
-
-def _cost_ahead(search: Search, rig: Rig) -> float:
-    """Mean square of a rig's one-step-ahead residual, in units of the noise."""
-    residual = search.ahead.residual(rig)
-    return float(residual @ residual) / residual.size
 
 
 def _finalists(steps: Sequence[JointFit], cost_limit: float) -> list[JointFit]:

@@ -308,7 +308,7 @@ class Selection(Protocol[Model, Candidate]):
 
 @dataclass
 class OrderSelection(Generic[Model, Candidate]):
-    """OrderSelection selection of modes, forward and backward.
+    """Stepwise selection of modes, forward and backward.
 
     Attributes:
         problem: see `Selection`.
@@ -356,7 +356,7 @@ class OrderSelection(Generic[Model, Candidate]):
     def forward(self, model: Model) -> Model:
         """The model with every candidate of significant gain."""
         weak = splits = 0
-        own_budget = self.time_limit.share(SELECTION.forward_share)
+        own_limit = self.time_limit.share(SELECTION.forward_share)
         if self.cut_short:
             self.time_limit.unfinished.pop(FURTHER, None)
             self.cut_short = False
@@ -367,7 +367,7 @@ class OrderSelection(Generic[Model, Candidate]):
             and weak < self.most_weak
             and (self.most_splits is None or splits < self.most_splits)
             # The first mode is searched whatever the time.
-            and not (self.problem.n_modes(model) and self._ends(own_budget))
+            and not (self.problem.n_modes(model) and self._ends(own_limit))
         ):
             candidate = self.problem.strongest(model, self.rejected)
             if candidate is None:
@@ -391,9 +391,9 @@ class OrderSelection(Generic[Model, Candidate]):
             self.rejected.append((complex(pole), gain))
         return model
 
-    def _ends(self, own_budget: TimeLimit) -> bool:
+    def _ends(self, own_limit: TimeLimit) -> bool:
         """Whether the time of the forward search is up; sets `cut_short`."""
-        self.cut_short = own_budget.spent(FURTHER)
+        self.cut_short = own_limit.spent(FURTHER)
         return self.cut_short
 
     def backward(self, model: Model) -> Model:
