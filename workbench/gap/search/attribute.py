@@ -9,7 +9,7 @@ import numpy as np
 
 from workbench.arrays import Floats
 from workbench.deadline import NEVER, Deadline
-from workbench.gap.effects.effect import Effect, Kind, apply_all, each_left_out, simpler_forms
+from workbench.gap.effects.effect import Effect, Kind, apply_all, each_left_out, merged_sets, simpler_forms
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior, nominal_errors
 from workbench.gap.effects.ports import (
     SENSOR_CLIPPING,
@@ -29,12 +29,12 @@ from workbench.gap.search.errors_as_effects import (
     uniform_as_nominal_errors,
     with_delay_as_error,
 )
-from workbench.gap.search.finish import widened
+from workbench.gap.search.finish import ranked, widened
 from workbench.gap.search.fit import Chord, Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.jointly import fit_jointly, with_all_errors
 from workbench.gap.search.screening import on_whole_records, one_more
-from workbench.gap.search.search import Search, best_of_each, best_of_each_kind, most_informative
+from workbench.gap.search.search import Rivals, Search, best_of_each, best_of_each_kind, most_informative
 from workbench.gap.search.settings import ATTRIBUTION, PAIRS, SELECTION
 from workbench.gap.search.stages import Stages
 from workbench.records.record import Record
@@ -69,7 +69,7 @@ class Attribution:
     outcome: str
     best: Fit
     random: RandomForceFit | None
-    alternatives: tuple[tuple[Fit, float], ...]
+    alternatives: Rivals
     nominal_cost: float
     tried: tuple[Fit, ...]
     ahead: tuple[Fit, ...]
@@ -236,6 +236,7 @@ def attribute(
     best = uniform_as_nominal_errors(search, best, alone=random is not None)
     if outcome == "explained" and random is None:
         best = _with_one_for_two(final_search, widened(final_search, best))
+        best, rivals = _merged(final_search, best, rivals)
     if seen:
         best = replace(best, effects=(*seen, *(e for e in best.effects if not e.is_in_readings)))
         outcome = "explained" if outcome == "none" else outcome
@@ -302,6 +303,19 @@ def _with_one_for_two(search: Search, best: Fit) -> Fit:
             if search.explains(fewer) and not search.tells_apart(here, fewer.cost, extra):
                 return fewer
     return best
+
+
+def _merged(search: Search, best: Fit, rivals: Rivals) -> tuple[Fit, Rivals]:
+    """The fit and its rivals, or that with two effects replaced by the one that both may be, if that is likelier.
+
+    Friction and a constant force of an actuator beside it are nearly friction that differs between the directions.
+    """
+    sets = list(merged_sets(best.effects))
+    if not sets:
+        return best, rivals
+    merged = [fit for fit in (_refitted(search, effects, search.data) for effects in sets) if search.explains(fit)]
+    likeliest, others = ranked(search, [_refitted(search, best.effects, search.data), *merged])
+    return (best, rivals) if likeliest.key == best.key else (likeliest, others)
 
 
 def _refitted(search: Search, effects: Sequence[Effect], data: FitData) -> Fit:

@@ -19,7 +19,7 @@ from workbench.gap.effects.effect import (
 )
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.search.fit import Chord, Fit, cost_of, finite_residual, fit
-from workbench.gap.search.search import Search, best_of_each, promise
+from workbench.gap.search.search import Rivals, Search, best_of_each, promise
 from workbench.gap.search.settings import FINISH, SEARCH, SELECTION
 from workbench.rig.simulate import is_stepped
 from workbench.structure.domain import Between, Domain, Interval, Rectangle, Where
@@ -212,7 +212,7 @@ def _simpler_sets(search: Search, candidate: Fit) -> Iterator[tuple[Effect, ...]
     yield from simpler_sets(candidate.effects, search.rig)
 
 
-def ranked(search: Search, fits: Sequence[Fit]) -> tuple[Fit, tuple[tuple[Fit, float], ...]]:
+def ranked(search: Search, fits: Sequence[Fit]) -> tuple[Fit, Rivals]:
     """The set of least description length, and the others with their probabilities.
 
     The likelihood of tens of thousands of values is over-confident about small misfits, so half its logarithm is used.
@@ -235,10 +235,10 @@ def _weighted(search: Search, fits: Sequence[Fit]) -> list[tuple[Fit, float]]:
 def with_equals(
     search: Search,
     best: Fit,
-    rivals: tuple[tuple[Fit, float], ...],
+    rivals: Rivals,
     evidence: Evidence,
     alike: Sequence[tuple[str, str, float]],
-) -> tuple[tuple[Fit, float], ...]:
+) -> Rivals:
     """The rivals of a set, with the equivalent sets that have an effect at another actuator or sensor.
 
     With one actuator and one sensor, errors of the one and of the other have the same effect. One-step-ahead

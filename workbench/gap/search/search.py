@@ -25,6 +25,7 @@ from workbench.structure.member import Structure
 
 Candidate = TypeVar("Candidate")
 Found = TypeVar("Found")
+Rivals = tuple[tuple[Fit, float], ...]  # other sets with their probabilities, most probable first
 
 
 @dataclass(frozen=True, eq=False)
@@ -349,12 +350,12 @@ class Decision(NamedTuple):
     outcome: str
     best: Fit
     random: RandomForceFit | None = None
-    rivals: tuple[tuple[Fit, float], ...] = ()
+    rivals: Rivals = ()
     noise: np.ndarray | None = None
     beside: Search | None = None
 
 
-def unexplained(start: Fit, best: Fit, rivals: tuple[tuple[Fit, float], ...]) -> Decision:
+def unexplained(start: Fit, best: Fit, rivals: Rivals) -> Decision:
     """The verdict where no set reaches the noise floor: explained in part (half of the gap's rms), or unknown.
 
     Args:
