@@ -300,3 +300,10 @@ def test_a_small_blind_trial_is_passed(kinds):
     held = hold_trials(len(kinds), 314, kinds=kinds)
     assert all(s["kinds"] for s in held.scores.values()), held.tally.counts
     assert held.tally.misplaced == 0
+
+
+def test_no_gain_of_a_sensor_looks_like_another_unit():
+    kinds = ("one_sided_stop", "random_disturbance", "sensor_gain")
+    _, truth = make_trial(20390403, kinds=kinds, imperfections="triple")  # was drawn as 130
+    (gain,) = (effect["gain"] for effect in truth["effects"] if effect["kind"] == "sensor_gain")
+    assert 0.1 <= abs(gain) <= 10.0

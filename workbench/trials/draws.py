@@ -242,6 +242,11 @@ def _reading(name: str, number: Callable[[Scene, np.ndarray, float], float], *, 
     return draw
 
 
+def _gain(logarithm: float) -> float:
+    """A gain between 0.1 and 10: beyond, a channel in another unit is likelier, and a diagnosis asks for the unit."""
+    return float(np.exp(np.clip(logarithm, -np.log(10.0), np.log(10.0))))
+
+
 def _quantisation(scene: Scene, rng: np.random.Generator) -> Numbers:
     sensor, y = _sensor(scene, rng)
     step = float(f"{min(rng.uniform(4.0, 12.0) * sensor.noise_std, 0.3 * y.std()):.3g}")
@@ -299,7 +304,7 @@ DRAWS: dict[str, Draw] = {
     "point_damper": _damper,
     "air_drag": _drag,
     "midplane_stretching": _stretching,
-    "actuator_gain": _drive("gain", lambda c, x: np.exp(0.2 * x), every=0.0, signed=True),
+    "actuator_gain": _drive("gain", lambda c, x: _gain(0.2 * x), every=0.0, signed=True),
     "actuator_lag": _drive("time_constant", _late),
     "actuator_delay": _drive("delay", _late),
     "actuator_saturation": _drive("limit", lambda c, x: np.abs(c.commands).max() * np.exp(-0.5 * x)),
@@ -309,7 +314,7 @@ DRAWS: dict[str, Draw] = {
     "actuator_bias": _drive("force", lambda c, x: 0.1 * x * c.bench.level, every=0.0, signed=True),
     "actuator_rate_limit": _drive("rate", _rate_limit),
     "swapped_inputs": _swapped_inputs,
-    "sensor_gain": _reading("gain", lambda c, y, x: np.exp(0.3 * x), signed=True),
+    "sensor_gain": _reading("gain", lambda c, y, x: _gain(0.3 * x), signed=True),
     "sensor_bias": _reading("bias", lambda c, y, x: 0.3 * x * y.std(), signed=True),
     "sensor_drift": _reading("drift_over_record", lambda c, y, x: 0.5 * x * y.std(), signed=True),
     "sensor_lag": _sensor_lag,
