@@ -7,7 +7,8 @@ import pytest
 
 from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import kind_named
-from workbench.gap.localisation.evidence import Evidence, locate_force
+from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.localisation.force_location import locate_force
 from workbench.gap.prediction.residuals import FitData
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig

@@ -12,7 +12,7 @@ from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all, can_be, names_in
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior, NominalPrior
 from workbench.gap.effects.nonlinear import any_beyond
-from workbench.gap.localisation.evidence import locate_force
+from workbench.gap.localisation.force_location import locate_force
 from workbench.gap.localisation.where import locate
 from workbench.gap.prediction.noise import LOGGED, noise_guessed
 from workbench.gap.prediction.residuals import lead_of

@@ -7,8 +7,9 @@ import pytest
 
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.localisation import force_lines
-from workbench.gap.localisation.evidence import Evidence, locate_force
+from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.force_lines import lines_of
+from workbench.gap.localisation.force_location import locate_force
 from workbench.gap.localisation.where import locate
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import sampled_model

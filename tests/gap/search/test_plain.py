@@ -21,8 +21,7 @@ from workbench.gap.search.errors_as_effects import (
 )
 from workbench.gap.search.fit import Fit, fit
 from workbench.gap.search.intervals import with_intervals
-from workbench.gap.search.joint_starts import surely_late
-from workbench.gap.search.jointly import fit_jointly, size_of, with_all_errors
+from workbench.gap.search.jointly import fit_jointly, size_of, surely_late, with_all_errors
 from workbench.gap.search.plain import (
     _at_ports,
     few_with_uniform_errors,

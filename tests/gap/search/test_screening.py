@@ -16,7 +16,7 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.report.budget import RUNAWAY, residual_powers
 from workbench.gap.search.fit import Fit, fit, slopes
-from workbench.gap.search.joint_starts import fit_from_zero
+from workbench.gap.search.jointly import fit_from_zero
 from workbench.gap.search.pairs import Pairs, _evidence_with
 from workbench.gap.search.screening import Screening, _starts, fitted_ahead, one_more
 from workbench.gap.search.search import Search

@@ -16,8 +16,7 @@ from workbench.gap.prediction.noise import are_coloured, noise_found
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.search.fit import Fit, cost_of, fit, sensitivity
-from workbench.gap.search.joint_starts import fit_from_zero
-from workbench.gap.search.jointly import evaluated
+from workbench.gap.search.jointly import evaluated, fit_from_zero
 from workbench.gap.search.search import Search
 from workbench.gap.search.stepwise import Stepwise
 from workbench.rig.actuators import Actuator

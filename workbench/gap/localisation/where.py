@@ -8,7 +8,8 @@ import numpy as np
 
 from workbench.arrays import Flags, Floats
 from workbench.gap.effects.effect import Effect
-from workbench.gap.localisation.evidence import Evidence, ForceLocation
+from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.localisation.force_location import ForceLocation
 from workbench.gap.prediction.residuals import scale_of
 from workbench.identification.signal.distortion import distortion_of, period_of
 from workbench.records.record import Record

@@ -6,8 +6,14 @@ from functools import partial
 from workbench.gap.effects.effect import contained, each_left_out, key_of, merged_sets, simpler_sets, with_one_simpler
 from workbench.gap.search.errors_as_effects import may_be_port_errors
 from workbench.gap.search.fit import Fit, parameters_of
-from workbench.gap.search.joint_starts import fitted_to_all, fitted_to_quick
-from workbench.gap.search.jointly import JointFit, fit_jointly, surely_prefers, too_large
+from workbench.gap.search.jointly import (
+    JointFit,
+    fit_jointly,
+    fitted_to_all,
+    fitted_to_quick,
+    surely_prefers,
+    too_large,
+)
 from workbench.gap.search.search import Search, best_of_each_kind
 from workbench.gap.search.settings import JOINT, SEARCH, STEPWISE
 

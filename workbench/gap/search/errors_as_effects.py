@@ -20,8 +20,16 @@ from workbench.gap.effects.ports import (
 )
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.search.fit import Fit, cost_of
-from workbench.gap.search.joint_starts import TIMING, fit_from_zero
-from workbench.gap.search.jointly import JointFit, evaluated, fit_jointly, is_likelier, size_of, with_all_groups
+from workbench.gap.search.jointly import (
+    TIMING,
+    JointFit,
+    evaluated,
+    fit_from_zero,
+    fit_jointly,
+    is_likelier,
+    size_of,
+    with_all_groups,
+)
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import ERRORS, JOINT, STEPWISE
 from workbench.rig.rig import Rig

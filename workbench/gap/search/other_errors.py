@@ -10,8 +10,7 @@ from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import differing, figures_of
 from workbench.gap.search.errors_as_effects import PORT_GROUPS
 from workbench.gap.search.fit import finite_residual
-from workbench.gap.search.joint_starts import fit_from_zero
-from workbench.gap.search.jointly import JointFit, too_large
+from workbench.gap.search.jointly import JointFit, fit_from_zero, too_large
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import INTERVALS, RECORDS, STEPWISE
 from workbench.gap.search.stepwise import Stepwise

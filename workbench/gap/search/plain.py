@@ -23,8 +23,7 @@ from workbench.gap.search.errors_as_effects import (
 from workbench.gap.search.finish import finished, other_places, ranked
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
-from workbench.gap.search.joint_starts import surely_late, with_reading_sides
-from workbench.gap.search.jointly import JointFit
+from workbench.gap.search.jointly import JointFit, surely_late, with_reading_sides
 from workbench.gap.search.screening import Screening, on_whole_records, one_more
 from workbench.gap.search.search import Search, first_of_each, promise
 from workbench.gap.search.settings import ERRORS, PAIRS, PLAIN, SEARCH, SELECTION, STEPWISE

@@ -31,15 +31,19 @@ from workbench.gap.search.errors_as_effects import (
 )
 from workbench.gap.search.finish import PORTS, other_places
 from workbench.gap.search.fit import Fit, cost_of, fit
-from workbench.gap.search.joint_starts import TIMING, fit_from_zero, fitted_to_all, fitted_to_quick, with_reading_sides
 from workbench.gap.search.jointly import (
+    TIMING,
     JointFit,
     are_plausible,
     evaluated,
+    fit_from_zero,
     fit_jointly,
+    fitted_to_all,
+    fitted_to_quick,
     is_likelier,
     loss,
     with_input_noise,
+    with_reading_sides,
 )
 from workbench.gap.search.plain import few_with_uniform_errors, in_place_of_nominal_errors, other_delay_causes
 from workbench.gap.search.screening import fitted_ahead, one_more

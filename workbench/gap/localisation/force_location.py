@@ -1,0 +1,185 @@
+"""The place of one unmodelled force, of any law, and whether one force explains the gap."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize, minimize_scalar
+
+from workbench.arrays import Floats
+from workbench.gap.localisation.evidence import Evidence, minima
+from workbench.gap.localisation.force_lines import Lines
+from workbench.renamed import Renamed
+from workbench.structure.domain import Between, Interval, NamedPoints, Rectangle
+from workbench.threads import one_blas_thread
+
+
+@dataclass(frozen=True)
+class LocalisationSettings:
+    """Constants of the localisation of one force."""
+
+    valleys: int = 3  # local minima of the misfit that are refined
+    rounds: int = 3  # alternations between the place and the weights of the lines
+    beside: float = 0.95  # of the grid spacing: range about a minimum in which it is refined
+    resolved: float = 1e-3  # of the grid spacing: tolerance of the refinement
+    pairs_shown: int = 12  # of named points
+    two_sigma: float = 4.0  # rise of the misfit at two standard errors
+    noise: float = 0.1  # of the noise power: largest excess of the residual given one force
+    all_but: float = 1e-5  # of the gap, likewise
+    chance: float = 3.0  # standard deviations of a sum of squares
+    edge: float = 1e-4  # of the length: least distance of a place from the ends
+    near: float = 0.02  # of a rectangle's size: first simplex about a peak
+    tolerance: float = 1e-2  # of the misfit, in units of the noise variance
+    evaluations: int = 60  # of the simplex search
+    curved_over: float = 0.1  # of that simplex: step of the second difference of the misfit
+    bisections: int = 6  # of the distance at which the misfit has risen
+
+
+LOCALISATION = LocalisationSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class ForceLocation:
+    """Likelihood of one force of any law at each place, and the likeliest place.
+
+    Attributes:
+        places: (n_places,) on the structure.
+        profile: (n_places,) log-likelihood, relative to that of the likeliest place.
+        at: the likeliest place.
+        at_std: standard error of the place, m, from a quarter of the 2-sigma interval, inflated by the residual above
+            the noise; on a rectangle along the longer axis of the region; 0 for named places.
+        share: of the gap's power above the noise that one force there explains.
+        is_single_force: whether one force reduces the gap to noise, or to a negligible share; None if that cannot be
+            tested: no gap, one sensor, or records too short.
+    """
+
+    places: Sequence[Any]
+    profile: np.ndarray
+    at: Any
+    at_std: float
+    share: float
+    is_single_force: bool | None
+
+    holds = Renamed("is_single_force")
+
+
+@one_blas_thread
+def locate_force(evidence: Evidence) -> ForceLocation:
+    """Locate the one force, of any law, that best explains the gap.
+
+    One sensor locates nothing, since a force anywhere explains its readings. Sensors with a lag are left out.
+    """
+    evidence = evidence.without([sensor.name for sensor in evidence.rig.sensors if sensor.time_constant > 0])
+    domain, places = evidence.domain, evidence.places
+    at: Any = evidence.peaks[0]
+    if len(evidence.rig.sensors) < 2:
+        std = 0.0 if isinstance(domain, NamedPoints) else domain.size / np.sqrt(12.0)
+        return ForceLocation(places, np.zeros(len(places)), at, std, 0.0, None)
+    informative = evidence.informative(at)
+    if isinstance(domain, Interval):
+        valleys = places[minima(evidence.misfits(places, informative))[: LOCALISATION.valleys]]
+        # minima are compared by equal weights: each one's own would favour it
+        at = min(evidence.workers.map(partial(_refined, evidence), valleys), key=evidence.misfit)
+        informative = evidence.informative(at)
+        profile, std = evidence.misfits(places, informative), _deviation(evidence, informative, at)
+    elif isinstance(domain, Rectangle):
+        refined = [_refined_over(evidence, domain, peak) for peak in evidence.peaks]
+        at, std = min(refined, key=lambda each: evidence.misfit(each[0]))
+        informative = evidence.informative(at)
+        profile = evidence.screened(places, informative)
+    else:
+        ranked = [places[i] for i in np.argsort(-evidence.profile, kind="stable") if isinstance(places[i], Between)]
+        points = [where for where in places if not isinstance(where, Between)]
+        places = [*points, *ranked[: LOCALISATION.pairs_shown]]
+        profile = evidence.misfits(places, informative)
+        at, std = places[int(np.argmin(profile))], 0.0
+    lowest = min(evidence.misfit(at, informative), profile.min())
+    degrees_of_freedom = sum(each.degrees_of_freedom for each in evidence.lines)
+    left = evidence.misfit(at) / max(degrees_of_freedom, 1) - 1.0
+    std *= np.sqrt(max(left, 0.0) + 1.0)
+    return ForceLocation(places, -0.5 * (profile - lowest), at, std, *_explained(evidence, degrees_of_freedom, left))
+
+
+def _explained(evidence: Evidence, degrees_of_freedom: int, left: float) -> tuple[float, bool | None]:
+    """Share of the gap's power that one force explains, and whether that is all of it; None if it cannot be tested.
+
+    Args:
+        evidence: of the nominal rig.
+        degrees_of_freedom: of the residual given the force.
+        left: its power above the noise, in units of the noise power.
+    """
+    values = 2 * sum(each.left.size for each in evidence.lines)
+    gap = sum(each.power for each in evidence.lines) - values
+    if degrees_of_freedom == 0 or gap < LOCALISATION.chance * np.sqrt(2.0 * values):
+        return 0.0, None
+    chance = LOCALISATION.chance * np.sqrt(2.0 / degrees_of_freedom)
+    share = float(np.clip(1.0 - left * degrees_of_freedom / gap, 0.0, 1.0))
+    return share, bool(left < LOCALISATION.noise + chance or share > 1.0 - LOCALISATION.all_but)
+
+
+def _refined_over(
+    evidence: Evidence, rectangle: Rectangle, top: tuple[float, float]
+) -> tuple[tuple[float, float], float]:
+    """The local minimum of the misfit on a rectangle, and its standard error along the longer axis, m."""
+    informative, extent = evidence.informative(top), np.array(rectangle.length)
+
+    def inside(xy: Floats) -> tuple[float, float]:
+        x, y = np.clip(xy, LOCALISATION.edge * extent, (1.0 - LOCALISATION.edge) * extent)
+        return float(x), float(y)
+
+    def misfit(xy: Floats) -> float:
+        return evidence.misfit(inside(xy), informative)
+
+    reach = LOCALISATION.near * rectangle.size
+    options = {
+        "initial_simplex": np.array(top) + reach * np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]),
+        "xatol": LOCALISATION.resolved * reach,
+        "fatol": LOCALISATION.tolerance,
+        "maxfev": LOCALISATION.evaluations,
+    }
+    found = minimize(misfit, top, method="Nelder-Mead", options=options)
+    at, step = inside(found.x), LOCALISATION.curved_over * reach
+    curvatures = [misfit(at + h) + misfit(at - h) - 2.0 * found.fun for h in step * np.array([(1, 0), (0, 1)])]
+    flattest = max(min(curvatures), 1e-12)  # of |r|², twice the log-likelihood ratio
+    return at, float(min(step * np.sqrt(2.0 / flattest), rectangle.size))
+
+
+def _refined(evidence: Evidence, top: float) -> float:
+    """The local minimum of the misfit along an interval."""
+    at, informative = float(top), evidence.informative(top)
+    length, spacing = evidence.domain.size, evidence.places[1] - evidence.places[0]
+    edge, beside = LOCALISATION.edge * length, LOCALISATION.beside * spacing
+    for _ in range(LOCALISATION.rounds):
+        found = minimize_scalar(
+            evidence.misfit,
+            bounds=(max(at - beside, edge), min(at + beside, length - edge)),
+            args=(informative,),
+            method="bounded",
+            options={"xatol": LOCALISATION.resolved * spacing},
+        )
+        moved, at = abs(found.x - at), float(found.x)
+        informative = evidence.informative(at)
+        if moved < LOCALISATION.resolved * spacing:
+            break
+    return at
+
+
+def _deviation(evidence: Evidence, lines: Sequence[Lines], at: float) -> float:
+    """Standard error of a place along an interval, m: a quarter of that in which the misfit rises by less than 4."""
+    length, level = evidence.domain.size, evidence.misfit(at, lines) + LOCALISATION.two_sigma
+
+    def is_outside(x: float) -> bool:
+        return not 0 < x < length or evidence.misfit(x, lines) > level
+
+    def distance(side: float) -> float:
+        inside, outside = 0.0, 1e-5 * length
+        while outside < length and not is_outside(at + side * outside):
+            inside, outside = outside, 2.0 * outside
+        for _ in range(LOCALISATION.bisections):
+            middle = 0.5 * (inside + outside)
+            inside, outside = (inside, middle) if is_outside(at + side * middle) else (middle, outside)
+        return outside
+
+    return (distance(-1.0) + distance(1.0)) / 4.0
