@@ -157,10 +157,10 @@ def diagnose(
             wired, added = apply_all(wired, attribution.missing), (*exchanged, *attribution.missing)
             evidence = evidence.of_rig(apply_all(evidence.rig, attribution.missing))
         if attribution.outcome == "explained" and attribution.random is None:
-            # rivals are fitted to the same whitened records as the best set
+            # alternatives are fitted to the same whitened records as the best set
             alike, search = ready().indistinguishable, replace(attribution.search, data=attribution.weighed)
-            rivals = with_equals(search, attribution.best, attribution.alternatives, evidence, alike)
-            attribution = replace(attribution, alternatives=rivals)
+            alternatives = with_equals(search, attribution.best, attribution.alternatives, evidence, alike)
+            attribution = replace(attribution, alternatives=alternatives)
         attribution = _validated(wired, attribution, validation, settle)
         if added:
             attribution = attribution.with_given(added, nominal)

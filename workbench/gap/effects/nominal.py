@@ -63,7 +63,7 @@ class NominalPrior:
         interpolated: whether delays are linear interpolations between samples, which have no jumps.
         points: named points of effects, where the mode shapes have errors as at the ports.
         waves: number of cosines of a smooth variation along the structure, the constant included.
-        records, figure: names of the records between which a parameter varies, and its name.
+        records, parameter: names of the records between which a parameter varies, and its name.
         by_mode: whether errors are those of each mode.
     """
 
@@ -84,7 +84,7 @@ class NominalPrior:
     points: tuple[str, ...] = ()
     waves: int = 9
     records: tuple[str, ...] = ()
-    figure: str = STIFFNESS
+    parameter: str = STIFFNESS
     by_mode: bool = False
 
     @property
@@ -314,7 +314,7 @@ def _with_errors(rig: Rig, prior: NominalPrior | IdentifiedPrior, values: dict[s
     rig = _structure_solved(
         rig, prior, {name: value for name, value in values.items() if group_of(name) not in OUTSIDE}
     )
-    rig = differing(rig, prior.figure, deviations_of(values))
+    rig = differing(rig, prior.parameter, deviations_of(values))
     ports: tuple[Actuator | Sensor, ...] = (*rig.actuators, *rig.sensors)
     units = _shape_units(rig.modes, ports) if prior.shape else np.zeros((len(ports), 0))
     if prior.shape and prior.points:
@@ -488,24 +488,24 @@ class OfOneRecord:
         return self.kind.apply(rig, None, {self.name: self.value})
 
 
-def figures_of(rig: Rig) -> tuple[str, ...]:
+def varying_parameters(rig: Rig) -> tuple[str, ...]:
     """Names of the parameters of a rig that may vary from record to record."""
     if not rig.modes.omega.any():
         return ()
     return (STIFFNESS, TENSION) if isinstance(rig.structure, Beam) else (STIFFNESS,)
 
 
-def differing(rig: Rig, figure: str, deviations: Mapping[str, float]) -> Rig:
+def differing(rig: Rig, parameter: str, deviations: Mapping[str, float]) -> Rig:
     """The rig with a parameter that varies from record to record.
 
     Args:
         rig: nominal.
-        figure: the parameter, of `figures_of`.
+        parameter: the parameter, of `varying_parameters`.
         deviations: by name of record: relative for the stiffness, over the buckling load for the axial load.
     """
 
     def change(deviation: float) -> OfOneRecord:
-        if figure == TENSION:
+        if parameter == TENSION:
             return OfOneRecord(AXIAL_LOAD, "tension", deviation * buckling_load(rig))
         return OfOneRecord(MODULUS_ERROR, "factor", 1.0 + deviation)
 
@@ -513,6 +513,6 @@ def differing(rig: Rig, figure: str, deviations: Mapping[str, float]) -> Rig:
     return replace(rig, by_record=changes) if changes else rig
 
 
-def label_of(figure: str) -> str:
+def label_of(parameter: str) -> str:
     """Label in the budget of a parameter that varies from record to record."""
-    return f"{figure.replace(' ', '_')}_record_to_record"
+    return f"{parameter.replace(' ', '_')}_record_to_record"

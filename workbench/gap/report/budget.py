@@ -243,7 +243,7 @@ def budget_of(
     labels, causes = labels_of(effects, rig.modes.domain), list(effects)
     common, varying = (None, None) if errors is None else parted(errors)
     if varying is not None:
-        labels.append(label_of(varying.target.figure))
+        labels.append(label_of(varying.target.parameter))
         causes.append(varying)
     causes += [] if common is None else [common]
     nominal, left = (residual_powers(rig, chosen, records, settle) for chosen in ((), causes))
@@ -361,12 +361,12 @@ class RecordToRecord:
     """A parameter of the nominal model that varies from record to record, as it was fitted.
 
     Attributes:
-        figure: "stiffness" or "axial load".
+        parameter: "stiffness" or "axial load".
         values: deviation from the common value, by name of record: relative, or a force.
         force: name of the unit of force.
     """
 
-    figure: str
+    parameter: str
     values: dict[str, float]
     force: str = "N"
 
@@ -376,14 +376,14 @@ class RecordToRecord:
         errors = next((found for found in (parted(e)[1] for e in effects) if found is not None), None)
         if errors is None:
             return None
-        figure = errors.target.figure
-        unit = buckling_load(rig) if figure == TENSION else 1.0
-        return cls(figure, {name: unit * value for name, value in deviations_of(errors.values).items()})
+        parameter = errors.target.parameter
+        unit = buckling_load(rig) if parameter == TENSION else 1.0
+        return cls(parameter, {name: unit * value for name, value in deviations_of(errors.values).items()})
 
     @property
     def label(self) -> str:
         """Label in the budget."""
-        return label_of(self.figure)
+        return label_of(self.parameter)
 
     @property
     def spread(self) -> float:
@@ -395,16 +395,16 @@ class RecordToRecord:
         """The spread and the extreme records, such as: 0.8 %: record low is 1.1 % stiffer than record high."""
         least, most = (pick(self.values, key=lambda name: self.values[name]) for pick in (min, max))
         difference = self._in_unit(self.values[most] - self.values[least])
-        how = f"has {difference} more than" if self.figure == TENSION else f"is {difference} stiffer than"
+        how = f"has {difference} more than" if self.parameter == TENSION else f"is {difference} stiffer than"
         return f"{self._in_unit(self.spread)}: record {most} {how} record {least}"
 
     def _in_unit(self, size: float) -> str:
-        return f"{size:.2g} {self.force}" if self.figure == TENSION else f"{100.0 * size:.2g} %"
+        return f"{size:.2g} {self.force}" if self.parameter == TENSION else f"{100.0 * size:.2g} %"
 
     def to_json(self) -> dict[str, Any]:
         """The parameter, its spread and its deviations as plain numbers: relative, or in the unit of force."""
         by_record = {name: _rounded(value) for name, value in self.values.items()}
-        return {"figure": self.figure, "std": _rounded(self.spread), "by_record": by_record}
+        return {"parameter": self.parameter, "std": _rounded(self.spread), "by_record": by_record}
 
 
 def with_held_out(

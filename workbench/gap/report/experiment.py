@@ -1,4 +1,4 @@
-"""What records can show: which effects, before any fit, and in which experiment two rival ones differ soonest."""
+"""What records can show: which effects, before any fit, and in which experiment two alternative sets differ soonest."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -139,9 +139,9 @@ class Experiment:
         like: name of the record whose input it repeats.
         inputs: names of the inputs that are driven; the others are zero.
         level: factor on that record's input.
-        seconds: length at which the rivals differ by five standard deviations, at least 16 samples and three periods of
-            the first elastic mode; inf if that takes over a thousand times the length of the record.
-        rivals: labels of the two explanations it separates.
+        seconds: length at which the alternatives differ by five standard deviations, at least 16 samples and three
+            periods of the first elastic mode; inf if that takes over a thousand times the length of the record.
+        alternatives: labels of the two explanations it separates.
         time: name of the unit of time.
     """
 
@@ -149,13 +149,15 @@ class Experiment:
     inputs: tuple[str, ...]
     level: float
     seconds: float
-    rivals: tuple[str, str]
+    alternatives: tuple[str, str]
     time: str = "s"
+
+    rivals = Renamed("alternatives")
 
     @property
     def sentence(self) -> str:
         """The proposal in a sentence."""
-        one, other = map(in_words, self.rivals)
+        one, other = map(in_words, self.alternatives)
         if not np.isfinite(self.seconds):
             return f"No experiment on this rig separates {one} from {other}."
         return (
@@ -164,20 +166,20 @@ class Experiment:
         )
 
 
-def next_experiment(rig: Rig, best: Fit, rival: Fit, data: FitData, workers: Workers) -> Experiment:
+def next_experiment(rig: Rig, best: Fit, alternative: Fit, data: FitData, workers: Workers) -> Experiment:
     """The experiment, among variations of the records, that distinguishes two fits in the shortest time.
 
     Both corrected rigs are simulated for each variation. The part of their difference that small changes of either
     one's parameters could cancel is projected out; the rest, in units of the noise, grows with time.
     """
-    names = (best.named, rival.named)
+    names = (best.named, alternative.named)
     elastic = rig.modes.frequencies_hz[rig.modes.frequencies_hz > 0]
 
     def experiment(choice: tuple[Record, tuple[str, ...], float]) -> Experiment:
         record, inputs, level = choice
         factors = level * np.array([name in inputs for name in record.input_names])
         varied = replace(record, inputs=record.inputs * factors[:, None])
-        rate = _separation(rig, best, rival, replace(data, records=(varied,)))
+        rate = _separation(rig, best, alternative, replace(data, records=(varied,)))
         if not rate * LONGEST * record.n_samples * record.sample_time > DETECTABLE:
             return Experiment("", (), 1.0, np.inf, names)
         seconds = max(DETECTABLE / rate, LEAST_SAMPLES * record.sample_time, *PERIODS / elastic[:1])
@@ -191,12 +193,12 @@ def next_experiment(rig: Rig, best: Fit, rival: Fit, data: FitData, workers: Wor
     return min(workers.map(experiment, choices), key=lambda each: each.seconds)
 
 
-def _separation(rig: Rig, best: Fit, rival: Fit, trial: FitData) -> float:
+def _separation(rig: Rig, best: Fit, alternative: Fit, trial: FitData) -> float:
     """Squared difference of two fits over the noise variance, per second, with their tangent spaces projected out."""
     with np.errstate(over="ignore", invalid="ignore"):
         try:
             first, first_slopes = _response(rig, best.effects, trial)
-            second, second_slopes = _response(rig, rival.effects, trial)
+            second, second_slopes = _response(rig, alternative.effects, trial)
         except (ValueError, np.linalg.LinAlgError):
             return 0.0
     difference = first - second

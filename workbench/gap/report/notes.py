@@ -154,7 +154,7 @@ def _of_record_deviations(errors: Effect | None, found: Attribution, held_out: S
     own = [record.name for record in held_out if record.name in fitted - {r.name for r in found.search.data.records}]
     if errors is not None and own and deviations_of(errors.values)[own[0]]:
         yield (
-            f"The {errors.target.figure} of record{'s' if len(own) > 1 else ''} {joined_in_words(own)} was fitted to"
+            f"The {errors.target.parameter} of record{'s' if len(own) > 1 else ''} {joined_in_words(own)} was fitted to"
             " the record itself for the budget; the share of the gap that closes is computed without it."
         )
 

@@ -214,7 +214,7 @@ class Verdict:
         if self.record_to_record is not None:
             varying = self.record_to_record
             share = _percent(self.budget.effects.get(varying.label, 0.0))
-            how = f"The {varying.figure} differs from record to record by {varying.words}"
+            how = f"The {varying.parameter} differs from record to record by {varying.words}"
             return f"{how}. This causes {share} of the gap{self._rest}."
         if self.budget.errors_are_small:
             return f"There is no gap beyond small errors of the nominal model{self._errors_in_words} and noise."
@@ -248,7 +248,7 @@ class Verdict:
         parts, varying = [], self.record_to_record
         if varying is not None and self.shows_gap:
             share = _percent(self.budget.effects.get(varying.label, 0.0))
-            parts.append(f"{share} are differences of {varying.figure} from record to record ({varying.words})")
+            parts.append(f"{share} are differences of {varying.parameter} from record to record ({varying.words})")
         if self.budget.nominal >= SHOWN:
             are = "may be" if self._is_open else "are"
             parts.append(f"{_percent(self.budget.nominal)} {are} {self._errors_named}")
@@ -317,8 +317,8 @@ class Verdict:
         lines += [f"record {name!r}: {_gap_in_words(gap, name)}" for name in gap["before"]]
         if self.alternatives and self.outcome == "explained":
             lines.append(f"named      probability {self.probability:.2g}, against")
-        rivals = self.alternatives_in_words[:ALTERNATIVES]
-        lines += [f"alternative {words} ({probability:.2g})" for words, probability in rivals]
+        alternatives = self.alternatives_in_words[:ALTERNATIVES]
+        lines += [f"alternative {words} ({probability:.2g})" for words, probability in alternatives]
         return "\n  ".join([*lines, *self.notes])
 
     @property

@@ -34,7 +34,7 @@ from workbench.gap.search.fit import Chord, Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.jointly import fit_jointly, with_all_errors
 from workbench.gap.search.screening import on_whole_records, one_more
-from workbench.gap.search.search import Rivals, Search, best_of_each, best_of_each_kind, most_informative
+from workbench.gap.search.search import Alternatives, Search, best_of_each, best_of_each_kind, most_informative
 from workbench.gap.search.settings import ATTRIBUTION, PAIRS, SELECTION
 from workbench.gap.search.stages import Stages
 from workbench.records.record import Record
@@ -69,7 +69,7 @@ class Attribution:
     outcome: str
     best: Fit
     random: RandomForceFit | None
-    alternatives: Rivals
+    alternatives: Alternatives
     nominal_cost: float
     tried: tuple[Fit, ...]
     ahead: tuple[Fit, ...]
@@ -228,7 +228,7 @@ def attribute(
     quick, first = most_informative(data, start.cost_by_channel)
     search = Search(rig, data, quick, first, catalogue, progress, workers, of_nominal, tolerance=tolerance)
     stages = Stages(search, start, evidence, nominal, uncertain_nominal)
-    outcome, best, random, rivals, noise, own_search = stages.decision()
+    outcome, best, random, alternatives, noise, own_search = stages.decision()
     missing, stages = stages.missing, stages.beside_missing or stages
     search = stages.search
     is_cut = search.is_over
@@ -238,7 +238,7 @@ def attribute(
     best = uniform_as_nominal_errors(search, best, alone=random is not None)
     if outcome == "explained" and random is None:
         best = _with_one_for_two(final_search, widened(final_search, best))
-        best, rivals = _merged(final_search, best, rivals)
+        best, alternatives = _merged(final_search, best, alternatives)
     if seen:
         best = replace(best, effects=(*seen, *(e for e in best.effects if not e.is_in_readings)))
         outcome = "explained" if outcome == "none" else outcome
@@ -271,7 +271,7 @@ def attribute(
         outcome=outcome,
         best=best,
         random=random,
-        alternatives=rivals,
+        alternatives=alternatives,
         nominal_cost=float(of_nominal.mean()),
         tried=tuple(stages.singles),
         ahead=tuple(stages.ahead),
@@ -307,17 +307,17 @@ def _with_one_for_two(search: Search, best: Fit) -> Fit:
     return best
 
 
-def _merged(search: Search, best: Fit, rivals: Rivals) -> tuple[Fit, Rivals]:
-    """The fit and its rivals, or that with two effects replaced by the one that both may be, if that is likelier.
+def _merged(search: Search, best: Fit, alternatives: Alternatives) -> tuple[Fit, Alternatives]:
+    """The fit and its alternatives, or that with two effects replaced by the one that both may be, if that is likelier.
 
     Friction and a constant force of an actuator beside it are nearly friction that differs between the directions.
     """
     sets = list(merged_sets(best.effects))
     if not sets:
-        return best, rivals
+        return best, alternatives
     merged = [fit for fit in (_refitted(search, effects, search.data) for effects in sets) if search.explains(fit)]
     likeliest, others = ranked(search, [_refitted(search, best.effects, search.data), *merged])
-    return (best, rivals) if likeliest.key == best.key else (likeliest, others)
+    return (best, alternatives) if likeliest.key == best.key else (likeliest, others)
 
 
 def _refitted(search: Search, effects: Sequence[Effect], data: FitData) -> Fit:

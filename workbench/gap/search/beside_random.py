@@ -195,10 +195,12 @@ def _improving(search: Search, whitened: Search, given: tuple[Effect, ...], evid
     places = [f.effects[-1].at for f in found if f.effects[-1].at is not None]
     if places:
         found = sorted((*found, *fitted(evidence.of_force_at(places[0]))), key=lambda f: f.cost)
-    rivals = [f for f in best_of_each_kind(found) if f.cost < found[0].cost + RANDOM.rival]
+    alternatives = [f for f in best_of_each_kind(found) if f.cost < found[0].cost + RANDOM.alternative]
     # small errors of gains and places remove a little of what the given effects leave
     before = cost_of(search.rig, given, search.data)
-    return [f for f in rivals if before - cost_of(search.rig, f.effects, search.data) > SEARCH.negligible * before]
+    return [
+        f for f in alternatives if before - cost_of(search.rig, f.effects, search.data) > SEARCH.negligible * before
+    ]
 
 
 def _without_clipped(search: Search, effects: Sequence[Effect], evidence: Evidence) -> tuple[Search, Evidence]:
@@ -223,8 +225,8 @@ def _best_decision(search: Search, tried: Sequence[WithRandom]) -> Decision | No
 
     justified = [found for found, _ in holding if is_justified(found)]
     plain = plainest(search, justified, worth=SEARCH.significant)
-    best, rivals = ranked(search, plain)
-    return Decision("explained", best, next(random for found, random in holding if found is best), rivals)
+    best, alternatives = ranked(search, plain)
+    return Decision("explained", best, next(random for found, random in holding if found is best), alternatives)
 
 
 def _fitted_with_random(search: Search, given: Fit, evidence: Evidence | None = None) -> WithRandom:

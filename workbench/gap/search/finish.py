@@ -19,7 +19,7 @@ from workbench.gap.effects.effect import (
 )
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.search.fit import Chord, Fit, cost_of, finite_residual, fit
-from workbench.gap.search.search import Rivals, Search, best_of_each, promise
+from workbench.gap.search.search import Alternatives, Search, best_of_each, promise
 from workbench.gap.search.settings import FINISH, SEARCH, SELECTION
 from workbench.rig.simulate import is_stepped
 from workbench.structure.domain import Between, Domain, Interval, Rectangle, Where
@@ -212,13 +212,13 @@ def _simpler_sets(search: Search, candidate: Fit) -> Iterator[tuple[Effect, ...]
     yield from simpler_sets(candidate.effects, search.rig)
 
 
-def ranked(search: Search, fits: Sequence[Fit]) -> tuple[Fit, Rivals]:
+def ranked(search: Search, fits: Sequence[Fit]) -> tuple[Fit, Alternatives]:
     """The set of least description length, and the others with their probabilities.
 
     The likelihood of tens of thousands of values is over-confident about small misfits, so half its logarithm is used.
     """
-    (best, _), *rivals = _weighted(search, fits)
-    return best, tuple(rivals[:6])
+    (best, _), *alternatives = _weighted(search, fits)
+    return best, tuple(alternatives[:6])
 
 
 def _weighted(search: Search, fits: Sequence[Fit]) -> list[tuple[Fit, float]]:
@@ -235,36 +235,36 @@ def _weighted(search: Search, fits: Sequence[Fit]) -> list[tuple[Fit, float]]:
 def with_equals(
     search: Search,
     best: Fit,
-    rivals: Rivals,
+    alternatives: Alternatives,
     evidence: Evidence,
     alike: Sequence[tuple[str, str, float]],
-) -> Rivals:
-    """The rivals of a set, with the equivalent sets that have an effect at another actuator or sensor.
+) -> Alternatives:
+    """The alternatives of a set, with the equivalent sets that have an effect at another actuator or sensor.
 
     With one actuator and one sensor, errors of the one and of the other have the same effect. One-step-ahead
     predictions depend on the sensor noise too, so they prefer one of them.
 
     Args:
-        rivals: with their probabilities.
+        alternatives: with their probabilities.
         evidence: of the nominal rig, for start values.
         alike: labels of two effects that the records cannot distinguish, and their correlation.
     """
     data = search.data.finely(SELECTION.fine)
-    known = {best.key, *(f.key for f, _ in rivals)}
+    known = {best.key, *(f.key for f, _ in alternatives)}
     sets = [s for s in _at_other_ports(search, best, evidence, alike) if key_of(s) not in known]
     if not sets:
-        return rivals
+        return alternatives
     here, *each = search.workers.map(lambda s: fit(search.rig, s, data), [best.effects, *sets])
-    equals = [f for f in each if f.cost < here.cost + SEARCH.rival]
+    equals = [f for f in each if f.cost < here.cost + SEARCH.alternative]
     if not equals:
-        return rivals
+        return alternatives
     weighted = _weighted(search, [here, *equals])
     # if no set reaches the noise floor, their residuals have no known likelihood: equal probabilities
     if not search.explains(weighted[0][0]):
         weighted = [(f, 1.0 / len(weighted)) for f, _ in weighted]
     own = next(p for f, p in weighted if f is here)
     beside = [(f, p) for f, p in weighted if f is not here]
-    return tuple(sorted([*beside, *((f, p * own) for f, p in rivals)], key=lambda each: -each[1]))
+    return tuple(sorted([*beside, *((f, p * own) for f, p in alternatives)], key=lambda each: -each[1]))
 
 
 def _at_other_ports(

@@ -7,7 +7,7 @@ import numpy as np
 
 from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, apply_all
-from workbench.gap.effects.nominal import differing, figures_of
+from workbench.gap.effects.nominal import differing, varying_parameters
 from workbench.gap.search.errors_as_effects import PORT_GROUPS
 from workbench.gap.search.fit import finite_residual
 from workbench.gap.search.jointly import JointFit, fit_from_zero, too_large
@@ -21,13 +21,13 @@ class Deviations:
     """Estimated deviations of one nominal parameter in each record, all else fixed.
 
     Attributes:
-        figure: the parameter, of `figures_of`.
+        parameter: the parameter, of `varying_parameters`.
         values, spread: (n_records,) deviations from their mean, and their standard errors.
         left: mean square residual with these deviations, in units of the noise.
         in_common: likewise with one deviation common to all records.
     """
 
-    figure: str
+    parameter: str
     values: Floats
     spread: Floats
     left: float
@@ -40,7 +40,7 @@ class Deviations:
         return bool(self.values[j] - self.values[i] > RECORDS.sure * np.hypot(self.spread[i], self.spread[j]))
 
 
-def deviations(search: Search, effects: Sequence[Effect], figure: str) -> Deviations | None:
+def deviations(search: Search, effects: Sequence[Effect], parameter: str) -> Deviations | None:
     """Least-squares deviations of a parameter in each record, by parabolic interpolation of the cost.
 
     None if the structure cannot have a deviation that is tried: a beam free at both ends bears no compression. The
@@ -48,14 +48,14 @@ def deviations(search: Search, effects: Sequence[Effect], figure: str) -> Deviat
 
     Args:
         effects: nominal errors among them.
-        figure: the parameter, of `figures_of`.
+        parameter: the parameter, of `varying_parameters`.
     """
     rig, data = apply_all(search.rig, effects), search.data
     names = [record.name for record in data.records]
     ends = np.cumsum([record.outputs.size for record in data.counted])[:-1]
     residuals = []  # by deviation tried, by record
     for deviation in RECORDS.tried:
-        residual = finite_residual(differing(rig, figure, dict.fromkeys(names, deviation)), (), data)
+        residual = finite_residual(differing(rig, parameter, dict.fromkeys(names, deviation)), (), data)
         if residual is None:
             return None
         residuals.append(np.split(residual, ends))
@@ -63,7 +63,7 @@ def deviations(search: Search, effects: Sequence[Effect], figure: str) -> Deviat
     least = [_parabola_minimum(cost) for cost in costs.T]
     values = np.array([at for at, _ in least])
     return Deviations(
-        figure=figure,
+        parameter=parameter,
         values=values - values.mean(),
         spread=np.array([_standard_error([each[i] for each in residuals], data.noise.size) for i in range(len(names))]),
         left=float(np.mean([cost for _, cost in least])),
@@ -96,7 +96,7 @@ def _varying_parameter(search: Search, step: JointFit) -> Deviations | None:
     if len(search.data.records) < 2:
         return None
     noise = float(step.noise_power.mean())
-    candidates = [deviations(search, step.fit.effects, figure) for figure in figures_of(search.rig)]
+    candidates = [deviations(search, step.fit.effects, parameter) for parameter in varying_parameters(search.rig)]
     sure = [d for d in candidates if d is not None and d.is_sure]
     promising = [d for d in sure if d.in_common - d.left > RECORDS.enough * (d.in_common - noise)]
     return min(promising, key=lambda d: d.left * (RECORDS.clearly if d is candidates[0] else 1.0), default=None)
@@ -118,8 +118,8 @@ def with_record_deviations(before: Stepwise) -> Stepwise | None:
     before.run()
     if before.decision().outcome == "explained":
         return before
-    search.progress(f"{varying.figure} that varies from record to record", 0.5)
-    varying_search = replace(search, differs=varying.figure)
+    search.progress(f"{varying.parameter} that varies from record to record", 0.5)
+    varying_search = replace(search, differs=varying.parameter)
     with_deviations = Stepwise(varying_search, before.ahead)
     # errors of profiles over-fit errors of single shapes
     if not (with_deviations.has_plausible_errors or search.prior.shape):

@@ -103,10 +103,10 @@ class Pairs:
         explaining = [f for f in likeliest if self.search.explains(f)]
         if explaining:
             plain = plainest(self.search, explaining)
-            best, rivals = ranked(self.search, self.search.side_by_side(simplest, plain))
-            return Decision("explained", best, rivals=rivals)
-        best, rivals = ranked(self.search, likeliest)
-        return unexplained(start, best, rivals)
+            best, alternatives = ranked(self.search, self.search.side_by_side(simplest, plain))
+            return Decision("explained", best, alternatives=alternatives)
+        best, alternatives = ranked(self.search, likeliest)
+        return unexplained(start, best, alternatives)
 
     def _add_and_check(self, ahead: Sequence[Fit]) -> bool:
         """Fit the best one-step-ahead pairs to whole records and refine them; whether one explains the records."""

@@ -25,12 +25,14 @@ from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.jointly import JointFit, surely_late, with_reading_sides
 from workbench.gap.search.screening import Screening, on_whole_records, one_more
-from workbench.gap.search.search import Search, first_of_each, promise
+from workbench.gap.search.search import Alternatives, Search, first_of_each, promise
 from workbench.gap.search.settings import ERRORS, PAIRS, PLAIN, SEARCH, SELECTION, STEPWISE
 from workbench.rig.rig import Rig
 
 
-def in_place_of_nominal_errors(search: Search, step: JointFit, rivals: Sequence[tuple[Effect, ...]] = ()) -> Fit | None:
+def in_place_of_nominal_errors(
+    search: Search, step: JointFit, alternatives: Sequence[tuple[Effect, ...]] = ()
+) -> Fit | None:
     """A set of few effects that explains the records with no nominal errors but uniform ones and those of ports.
 
     Such a set needs fewer parameters than nominal errors of every mode or wave. None if there is none, or if the
@@ -40,16 +42,16 @@ def in_place_of_nominal_errors(search: Search, step: JointFit, rivals: Sequence[
         search: with the noise estimated jointly with the nominal errors.
         step: effects and nominal errors fitted jointly; the delays of sensors are kept, and the gains and places of
             ports where nothing explains the records without.
-        rivals: other sets that explain the records with nominal errors, which can hide a wrong place or law.
+        alternatives: other sets that explain the records with nominal errors, which can hide a wrong place or law.
     """
     if step.errors.target.record:  # no effect varies from record to record
         return None
-    candidates = (_with_port_errors(search, step, rivals, kept) for kept in _at_ports(step.errors))
+    candidates = (_with_port_errors(search, step, alternatives, kept) for kept in _at_ports(step.errors))
     return next((found for found in candidates if found is not None), None)
 
 
 def _with_port_errors(
-    search: Search, step: JointFit, rivals: Sequence[tuple[Effect, ...]], kept: tuple[Effect, ...]
+    search: Search, step: JointFit, alternatives: Sequence[tuple[Effect, ...]], kept: tuple[Effect, ...]
 ) -> Fit | None:
     """The same as `in_place_of_nominal_errors`, given the errors of ports (`kept`) that stay."""
     effects = step.effects
@@ -66,7 +68,7 @@ def _with_port_errors(
             if found is not None or both is None:
                 return found
         return _one_uniform_error(search, common, kept, both, step)
-    sets = [(*given, *some) for given in (effects, *rivals) for some in _subsets(common)]
+    sets = [(*given, *some) for given in (effects, *alternatives) for some in _subsets(common)]
     if len(effects) > 1:  # without nominal errors, an effect may be unnecessary or a limiting case suffice
         fewer = list(each_left_out(effects))
         sets += [*fewer, *(s for given in (effects, *fewer) for s in simpler_sets(given, search.rig))]
@@ -160,7 +162,7 @@ def _with_delay_as_effect(search: Search, found: Fit) -> Fit:
     return min(explaining, key=lambda f: f.cost, default=found)
 
 
-def other_delay_causes(search: Search, found: Fit) -> tuple[tuple[Fit, float], ...]:
+def other_delay_causes(search: Search, found: Fit) -> Alternatives:
     """Other common causes of the delay of all sensors that explain the records as well, with their probabilities."""
     late = next(
         (e for e in found.effects if e.kind in DELAYS_OF_ALL and e.target == e.kind.targets(search.rig)[0]), None
@@ -168,8 +170,8 @@ def other_delay_causes(search: Search, found: Fit) -> tuple[tuple[Fit, float], .
     if late is None:
         return ()
     causes = [e for e in common_delays(search.rig, delay_of(late)) if e.kind is not late.kind]
-    best, rivals = ranked(search, [found, *_explaining_instead(search, found, late, causes)])
-    return rivals if best is found else ()
+    best, alternatives = ranked(search, [found, *_explaining_instead(search, found, late, causes)])
+    return alternatives if best is found else ()
 
 
 def _explaining_instead(search: Search, found: Fit, effect: Effect, causes: Sequence[Effect]) -> list[Fit]:

@@ -288,12 +288,12 @@ def on_whole_records(
     fits = search.workers.map(lambda f: by_continuation(search, f.effects, at_first), first)
     remaining = [f for f in close if f not in first]
     if any(search.explains(f) for f in fits):
-        remaining = [f for f in remaining if f.cost < ahead[0].cost + SEARCH.rival]
+        remaining = [f for f in remaining if f.cost < ahead[0].cost + SEARCH.alternative]
     others = _without_generalisations(search, fits, remaining)
     more = search.workers.map(lambda f: by_continuation(search, f.effects, at_first), others)
     fits = sorted((*fits, *more), key=promise)
     fits = _without_generalisations(search, fits, fits)
-    to_cost = min([to_cost, *(f.cost + SEARCH.rival for f in fits if search.explains(f))])
+    to_cost = min([to_cost, *(f.cost + SEARCH.alternative for f in fits if search.explains(f))])
     running = [f for f in fits if f.falling and promise(f) < SELECTION.running * promise(fits[0])]
     running = [f for f in running if promise(f, SEARCH.further) < to_cost]
     longer = search.workers.map(lambda f: whole(search, f.effects, 25), running)

@@ -25,7 +25,7 @@ from workbench.structure.member import Structure
 
 Candidate = TypeVar("Candidate")
 Found = TypeVar("Found")
-Rivals = tuple[tuple[Fit, float], ...]  # other sets with their probabilities, most probable first
+Alternatives = tuple[tuple[Fit, float], ...]  # other sets with their probabilities, most probable first
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +241,7 @@ class Search:
             record=0.005 if self.differs else 0.0,
             sample_time=self.data.records[0].sample_time,
             records=tuple(record.name for record in self.data.records) if self.differs else (),
-            figure=self.differs or STIFFNESS,
+            parameter=self.differs or STIFFNESS,
             by_mode=by_mode,
         )
 
@@ -350,21 +350,21 @@ class Decision(NamedTuple):
     outcome: str
     best: Fit
     random: RandomForceFit | None = None
-    rivals: Rivals = ()
+    alternatives: Alternatives = ()
     noise: np.ndarray | None = None
     beside: Search | None = None
 
 
-def unexplained(start: Fit, best: Fit, rivals: Rivals) -> Decision:
+def unexplained(start: Fit, best: Fit, alternatives: Alternatives) -> Decision:
     """The verdict where no set reaches the noise floor: explained in part (half of the gap's rms), or unknown.
 
     Args:
         start: the fit without effects.
         best: the set with the smallest residual.
-        rivals: other sets with their probabilities.
+        alternatives: other sets with their probabilities.
     """
     share_closed = 1.0 - np.sqrt(max(best.cost - 1.0, 0.0) / max(start.cost - 1.0, 1e-12))
-    return Decision("part" if share_closed > 0.5 else "unknown", best, rivals=rivals)
+    return Decision("part" if share_closed > 0.5 else "unknown", best, alternatives=alternatives)
 
 
 def nearest(search: Search, start: Fit, decision: Decision, fits: Sequence[Fit]) -> Decision:

@@ -22,7 +22,8 @@ class SearchSettings:
     significant: float = 0.01  # of the noise power: a smaller gain shows an imperfect model, not an effect
     elsewhere: float = 0.1  # of the extent: fits that start closer usually reach the same local minimum
     same_place: float = 0.02  # of the extent: fits as close as this have the same local minimum
-    rival: float = 0.02  # of the noise power: a set whose cost is higher by more is no rival of one that explains
+    # of the noise power: a set whose cost is higher by more is no alternative to one that explains the gap
+    alternative: float = 0.02
     further: int = 100  # iterations like the last: a fit that would still be too high after them is given up
     coarse: float = 2.0  # times the noise: quantisation in smaller steps adds nearly white noise
 
@@ -106,7 +107,8 @@ class RandomSettings:
     """Constants of the search for a random disturbance."""
 
     near: float = 0.1  # of the gap's power: a set with less left may only be in another local minimum
-    rival: float = 0.05  # of the noise power: an effect whose cost is higher by more than the best one's is no rival
+    # of the noise power: an effect whose cost is higher by more than the best one's is no alternative
+    alternative: float = 0.05
     starts: int = 2  # places from which the fit of a random force starts
     points: int = 4  # named points at which it is tried
     finalists: int = 4  # effects that are fitted to whole records through its whitening filter
@@ -302,7 +304,7 @@ class StepwiseSettings:
     noise_floor: float = 0.05
     # likewise, change of the readings with twice the substeps: if it is larger, finer ones are used
     stepping: float = 0.05
-    excluded: float = 1e-3  # probability below which another set is no rival
+    excluded: float = 1e-3  # probability below which another set is no alternative
     # of the nominal gap's power: with a larger residual, a fit that began one step ahead may have diverged
     astray: float = 0.02
 
@@ -322,7 +324,7 @@ class PairSettings:
     most: float = 0.3  # of the gap's power: a pair with a smaller residual may be two of three effects
     exchanges: int = 2  # rounds in which either half of the best pair is kept and the other exchanged
     tried_further: int = 2  # best pairs that are tried from other places
-    named: int = 4  # best sets that may be named or be rivals
+    named: int = 4  # best sets that may be named or be alternatives
 
 
 @dataclass(frozen=True)

@@ -196,7 +196,7 @@ class Stages:
         return None if law is None else _law_or_decision(law, self.search, self.pairs.decision(self.start))
 
     def record_deviations(self) -> Decision | None:
-        """Effects beside a figure of the model that differs from record to record."""
+        """Effects beside a parameter of the model that differs from record to record."""
         varied = None if self.search.is_over else with_record_deviations(self.stepwise)
         return None if varied is None else varied.decision()
 
@@ -291,13 +291,13 @@ class Stages:
 
     @cached_property
     def is_explained_by_one_beside_errors(self) -> bool:
-        """Whether small errors of the model explain the records, alone or with one effect."""
+        """Whether small errors of the model explain the records, alone or with one effect, which is selected."""
         stepwise = self.stepwise
         return bool(stepwise.is_sufficient or stepwise.without_errors() or stepwise.by_singles())
 
     @cached_property
     def is_explained_beside_errors(self) -> bool:
-        """Whether small errors of the model explain the records, alone or with few effects."""
+        """Whether small errors of the model explain the records, alone or with few effects, which are selected."""
         stepwise = self.stepwise
         # damping is hardly known: if only its errors are large, only an effect that makes them smaller is searched for
         return bool(
@@ -355,8 +355,8 @@ def _decide_on_singles(search: Search, start: Fit, singles: list[Fit]) -> tuple[
         explaining = [f for f in moved if search.explains(f)]
         singles = sorted((*moved, *singles), key=lambda f: f.cost)
     if explaining:
-        best, rivals = ranked(search, [simplest(search, f) for f in explaining])
-        return Decision("explained", best, rivals=rivals), singles
+        best, alternatives = ranked(search, [simplest(search, f) for f in explaining])
+        return Decision("explained", best, alternatives=alternatives), singles
     if search.explains(start):
         return Decision("none", start), singles
     return None, singles
@@ -366,7 +366,7 @@ def _finished_best(search: Search, fits: Sequence[Fit]) -> list[Fit]:
     """The fits; those that more iterations or finer substeps may bring to the noise floor are refined."""
     promising = [f for f in fits if f.cost < ATTRIBUTION.far_behind * fits[0].cost]
     if fits and search.explains(fits[0]):
-        near = fits[0].cost + SEARCH.rival
+        near = fits[0].cost + SEARCH.alternative
         promising = [
             f for f in promising if promise(f, SEARCH.further) < near or is_stepped(apply_all(search.rig, f.effects))
         ]
@@ -410,7 +410,7 @@ def _unless_other_law(search: Search, decision: Decision, evidence: Evidence) ->
     if not effect.kind.nonlinear or effect.at is None:
         return decision
     search.progress("one force of a law beyond the catalogue", 0.9)
-    as_near = cost_of(search.rig, best.effects, search.ahead) + SEARCH.rival
+    as_near = cost_of(search.rig, best.effects, search.ahead) + SEARCH.alternative
     fits = _forces_of_other_laws(search, evidence.of_force_at(effect.at), as_near)
     other = [f for f in fits if in_catalogue(f.effects[0]) is None]
     sure = (f for f in other if search.explains(f) and search.surely_better(f, best.cost, best.n_parameters))
@@ -420,6 +420,6 @@ def _unless_other_law(search: Search, decision: Decision, evidence: Evidence) ->
 
 def _law_or_decision(law: Fit, search: Search, decision: Decision) -> Decision:
     """The decision for the likelier of a force of another law and the sets of a decision."""
-    named = [decision.best, *(f for f, _ in decision.rivals)] if decision.outcome == "explained" else []
-    best, rivals = ranked(search, [law, *named])
-    return Decision("unknown" if any_beyond(best.effects) else "explained", best, rivals=rivals)
+    named = [decision.best, *(f for f, _ in decision.alternatives)] if decision.outcome == "explained" else []
+    best, alternatives = ranked(search, [law, *named])
+    return Decision("unknown" if any_beyond(best.effects) else "explained", best, alternatives=alternatives)

@@ -47,7 +47,7 @@ from workbench.gap.search.jointly import (
 )
 from workbench.gap.search.plain import few_with_uniform_errors, in_place_of_nominal_errors, other_delay_causes
 from workbench.gap.search.screening import fitted_ahead, one_more
-from workbench.gap.search.search import Decision, Search, apart, best_of_each_kind, most_informative
+from workbench.gap.search.search import Alternatives, Decision, Search, apart, best_of_each_kind, most_informative
 from workbench.gap.search.settings import FINISH, INPUTS, PLAIN, SEARCH, SELECTION, STEPWISE
 from workbench.rig.simulate import is_stepped
 from workbench.structure.domain import Where
@@ -600,8 +600,8 @@ class Stepwise:
         if step.logged > LEAST_LOGGED and not self.search.logged:
             search = with_input_noise(self.at_first, step.fit, step.sensor_noise) or search
         key, rig = key_of(step.effects), self.search.rig
-        rivals = [s.effects for s in self._others()[1:] if key not in contained(s.effects, rig)]
-        found = in_place_of_nominal_errors(search, step, rivals)
+        alternatives = [s.effects for s in self._others()[1:] if key not in contained(s.effects, rig)]
+        found = in_place_of_nominal_errors(search, step, alternatives)
         if found is None:
             return None
         # uniform stiffness and damping errors together are nominal errors; one alone is an effect
@@ -705,23 +705,25 @@ class Stepwise:
         """The verdict on the last set of effects."""
         beside = self.search if self.search.logged or self.has_finer_substeps else None
         if self.plain is not None:
-            rivals = self._rivals_of_plain
-            return Decision("explained", self.plain, rivals=rivals, noise=self.search.data.noise, beside=beside)
+            alternatives = self._alternatives_to_plain
+            return Decision(
+                "explained", self.plain, alternatives=alternatives, noise=self.search.data.noise, beside=beside
+            )
         effects, left = self.last.effects, self.unexplained
         noise = np.sqrt(self.last.sensor_noise) * self.search.data.noise
         closed = self.closes_gap or (len(effects) > 1 and left < STEPWISE.in_part)
         if effects and closed and not self.shows_unknown_law:
-            return Decision("explained", self.last.fit, rivals=self._rivals(), noise=noise, beside=beside)
+            return Decision("explained", self.last.fit, alternatives=self._alternatives(), noise=noise, beside=beside)
         if self.needs_no_effect:
             return Decision("none", self.last.fit, noise=noise, beside=beside)
         return Decision("part" if left < 0.5 else "unknown", self.last.fit, noise=noise, beside=beside)
 
     @cached_property
-    def _rivals_of_plain(self) -> tuple[tuple[Fit, float], ...]:
+    def _alternatives_to_plain(self) -> Alternatives:
         """Other causes that explain the records as well as `plain`, with their probabilities."""
         return () if self.plain is None else other_delay_causes(self.search, self.plain)
 
-    def _rivals(self) -> tuple[tuple[Fit, float], ...]:
+    def _alternatives(self) -> Alternatives:
         """Other sets that fit as well, with their probabilities by description length.
 
         If no set reaches the noise floor, only the description lengths of the nominal errors are compared: the
@@ -748,7 +750,7 @@ class Stepwise:
         if chosen is None:
             return []
         others = [s for s in chosen.others if key_of(s.effects) != key]
-        # a rival may have errors at the very bound of what is plausible
+        # an alternative may have errors at the very bound of what is plausible
         return [chosen, *(s for s in others if s.explains or is_as_good(s, chosen, self._gap, share=1.0))]
 
 

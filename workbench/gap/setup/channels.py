@@ -36,8 +36,9 @@ LEAST_DECREASE = 0.4
 UNCORRELATED = 0.9  # largest mean misfit that may remain there: uncorrelated signals have at least 1
 LEAST_SHARE = 0.5  # of the mean misfit there, which must go: the changes by a missing effect stay
 LEAST_BANDS = 0.8  # share of these bands in which the misfit must decrease
-MARGIN = 0.25  # mean misfit by which it must be better than any rival, where they differ: 2π and 9.81 differ by 0.44
-LEAST_DIFFERING = 0.1  # share of the affected bands in which it must differ from any rival
+# mean misfit by which it must be better than any alternative, where they differ: 2π and 9.81 differ by 0.44
+MARGIN = 0.25
+LEAST_DIFFERING = 0.1  # share of the affected bands in which it must differ from any alternative
 QUANTITIES = ("displacement", "velocity", "acceleration")
 NEAR = 0.15  # largest relative difference of a gain from a factor near it: the smallest ratio of two factors is 1.56
 # of a factor's logarithm: largest difference of the log gains of two records (2π: a factor 1.2 between them)
@@ -92,10 +93,10 @@ class Candidate:
 
 
 def accepted(gap: Comparison) -> list[Candidate]:
-    """The candidates whose correction removes most of the misfit where it acts, and more than any rival, best first.
+    """The candidates whose correction removes most of the misfit where it acts, more than any alternative; best first.
 
-    A rival affects at least half of the same bands: a fault elsewhere may be present too. An input without any effect
-    is among the rivals, since an unmodelled effect may have changed its response altogether.
+    An alternative affects at least half of the same bands: a fault elsewhere may be present too. An input without any
+    effect is among the alternatives, since an unmodelled effect may have changed its response altogether.
     """
     compared = compared_bands(gap.measured_spectra)
     before = gap.misfit[compared]
@@ -112,10 +113,10 @@ def accepted(gap: Comparison) -> list[Candidate]:
         least = max(LEAST_DECREASE, LEAST_SHARE * before[at].mean(), before[at].mean() - UNCORRELATED)
         if decrease.mean() < least or (decrease > 0).mean() < LEAST_BANDS:
             continue
-        rivals = affected[:, at].mean(axis=1) >= 0.5
-        rivals[i] = False
-        differs = np.abs(after[rivals] - after[i]) > AFFECTED
-        margin = np.where(differs, after[rivals] - after[i], 0.0).sum(axis=1)
+        alternatives = affected[:, at].mean(axis=1) >= 0.5
+        alternatives[i] = False
+        differs = np.abs(after[alternatives] - after[i]) > AFFECTED
+        margin = np.where(differs, after[alternatives] - after[i], 0.0).sum(axis=1)
         if (margin > MARGIN * np.maximum(differs.sum(axis=1), LEAST_DIFFERING * at.sum())).all():
             chosen.append(candidate)
     return chosen

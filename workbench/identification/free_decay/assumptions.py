@@ -74,11 +74,11 @@ class AmplitudeDependence:
     def remarks(self) -> tuple[str, ...]:
         """A remark on each mode that depends on amplitude or on time; a decay does not distinguish these."""
         return tuple(
-            f"mode {r + 1} depends on amplitude or time: {self.figures(r)}"
+            f"mode {r + 1} depends on amplitude or time: {self.as_text(r)}"
             for r in np.flatnonzero(self.depends).tolist()
         )
 
-    def figures(self, r: int) -> str:
+    def as_text(self, r: int) -> str:
         """Frequency, damping and amplitude of mode r in each segment, as text."""
         seen = np.flatnonzero(np.isfinite(self.omega[:, r]))
         each = zip(self.omega[seen, r] / (2.0 * np.pi), self.zeta[seen, r], self.amplitude[seen, r], strict=True)
@@ -133,7 +133,7 @@ def _segments(
     """
     modes = refined.modes
     edges = np.round((2.0 ** np.arange(stretches + 1) - 1) / (2.0**stretches - 1) * record.n_samples).astype(int)
-    figures = np.full((5, stretches, modes.n_modes), np.nan)
+    values_by_stretch = np.full((5, stretches, modes.n_modes), np.nan)
     spacing = np.abs(np.subtract.outer(modes.omega, modes.omega))
     dropped = [(at, at + (count - 1) * record.sample_time) for _, at, count, _ in dropouts(record)]
     least_rms = ASSUMPTIONS.rounded * steps(record)
@@ -174,9 +174,9 @@ def _segments(
         # Two modes whose beat is longer than the segment look like one that changes.
         sure &= beats[significant] * span > 2.0 * np.pi
         values = (refitted.modes.omega, refitted.omega_std, refitted.modes.zeta, refitted.zeta_std)
-        figures[0, w, significant[sure]] = np.sqrt(mean_square[:, significant[sure]].max(axis=0))
-        figures[1:, w, significant[sure]] = np.stack(values)[:, sure]
-    return record.start_time + record.sample_time * edges[:-1], figures
+        values_by_stretch[0, w, significant[sure]] = np.sqrt(mean_square[:, significant[sure]].max(axis=0))
+        values_by_stretch[1:, w, significant[sure]] = np.stack(values)[:, sure]
+    return record.start_time + record.sample_time * edges[:-1], values_by_stretch
 
 
 def _equality(values: np.ndarray, std: np.ndarray) -> np.ndarray:

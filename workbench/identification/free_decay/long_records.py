@@ -25,11 +25,11 @@ from scipy.stats import chi2
 from workbench.identification.free_decay.refinement import (
     amplitude_statistic,
     as_refined,
+    fitted_poles,
     identified,
     in_coloured_noise,
     noise_level,
     over_noise,
-    search,
     thresholds,
 )
 from workbench.identification.signal.modal_estimates import Identified
@@ -80,7 +80,7 @@ def identify_long(
     measured.run(max_modes)
     uncorrelated = independent(records, [fit.residual.T for fit in measured.fits]) if measured.poles.size else None
     if uncorrelated is None:
-        return measured.report(measured.statistic()) if measured.poles.size else None
+        return measured.refined(measured.statistic()) if measured.poles.size else None
     # Correlated noise makes peaks in all outputs; combinations of uncorrelated noise do without them.
     mixed = _Search(uncorrelated[0], false_alarm, measured.time_limit)
     mixed.origins = measured.origins
@@ -88,7 +88,7 @@ def identify_long(
     mixed.run(max_modes)
     measured.rejected += mixed.rejected
     measured.settle(mixed.poles, FIT.most_steps)
-    return measured.report(mixed.statistic()) if mixed.poles.size else None
+    return measured.refined(mixed.statistic()) if mixed.poles.size else None
 
 
 class _Search:
@@ -144,7 +144,7 @@ class _Search:
         """Fit all poles together, outputs weighted by the residual of the fit before."""
         self.poles, self.converged, self.steps = poles, True, 0
         if poles.size:
-            self.poles, self.fits, self.converged, self.steps = search(
+            self.poles, self.fits, self.converged, self.steps = fitted_poles(
                 self.records, poles, self.weights, True, most_steps, hold=True, time_limit=self.time_limit
             )
         else:
@@ -208,7 +208,7 @@ class _Search:
         shapes = np.hstack(np.split(over_noise(self.fits, self.weights)[:, which], len(self.fits)))
         return np.linalg.qr(np.hstack([shapes.real, shapes.imag]))[0]
 
-    def report(self, statistic: np.ndarray) -> Identified:
+    def refined(self, statistic: np.ndarray) -> Identified:
         """The modes with their covariance, and the statistic (n_modes,) of each."""
         fit = self.records, self.poles, self.fits, self.noise
         refined = as_refined(*fit, converged=self.converged, steps=self.steps)
@@ -315,6 +315,6 @@ class _Search:
             own = (a @ np.exp(np.outer(self.poles[near], self.dt * np.arange(record.n_samples)))).real
             projected.append(replace(record, outputs=residual.T + own, output_channels=channels))
         alone = np.ones((len(projected), directions.shape[1]))
-        _, with_it, *_ = search(projected, self.poles[near], alone, False, SELECTION.few_steps)
-        _, without, *_ = search(projected, self.poles[near[near != r]], alone, False, SELECTION.few_steps)
+        _, with_it, *_ = fitted_poles(projected, self.poles[near], alone, False, SELECTION.few_steps)
+        _, without, *_ = fitted_poles(projected, self.poles[near[near != r]], alone, False, SELECTION.few_steps)
         return float(sum((a.residual**2).sum() - (b.residual**2).sum() for a, b in zip(without, with_it, strict=True)))

@@ -26,11 +26,11 @@ from workbench.identification.free_decay.long_records import identify_long
 from workbench.identification.free_decay.preparation import decay_start, decays
 from workbench.identification.free_decay.refinement import (
     amplitude_statistic,
+    fitted_poles,
     identified,
     in_coloured_noise,
     over_noise,
     refine,
-    search,
     thresholds,
     unshaped,
 )
@@ -218,7 +218,7 @@ def _identify_stepwise(
             fewer = other.fitted(all_modes, fewer.weights)
         problem, model = other, fewer
     problem.time_limit = time_limit
-    return problem.report(model) if model.poles.size else None
+    return problem.refined(model) if model.poles.size else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -400,7 +400,7 @@ class _FreeDecay:
         span = max(record.n_samples * record.sample_time for record in self.records)
         return poles[(poles.real * span < SELECTION.most_growth) & (np.abs(poles) * span > 2.0 * np.pi)]
 
-    def report(self, model: _Model) -> Identified:
+    def refined(self, model: _Model) -> Identified:
         """The modes refined in the records as measured: whitening filters lose the first samples, the strongest."""
         poles, records = model.poles, self.measured
         if self.time_limit.unfinished:  # perhaps before all modes were tested
@@ -408,14 +408,14 @@ class _FreeDecay:
             poles = poles[~spurious] if not spurious.all() else poles
             self.rejected += [(complex(pole), 0.0) for pole in model.poles if pole not in poles]
         refined = refine(records, unshaped(poles, records[0]), offset=True, time_limit=self.time_limit)
-        while (lost := self._lost(poles, refined.modes.poles)).any() and not lost.all():
+        while (lost := self._lost_in_refinement(poles, refined.modes.poles)).any() and not lost.all():
             poles = poles[~lost]
             refined = refine(records, unshaped(poles, records[0]), offset=True, time_limit=self.time_limit)
         statistic = replace(model, poles=poles, fits=self._projected(poles)).statistic[np.argsort(np.abs(poles))]
         refined = in_coloured_noise(refined, records)
         return identified(refined, statistic, self.limit, self.rejected, records[0], self.time_limit.remarks)
 
-    def _lost(self, poles: np.ndarray, refined: np.ndarray) -> np.ndarray:
+    def _lost_in_refinement(self, poles: np.ndarray, refined: np.ndarray) -> np.ndarray:
         """Which modes moved away or became overdamped in the refinement, fitted to a part of the record that is no
         mode, (n_modes,)."""
         distance = np.abs(np.subtract.outer(poles, refined))
@@ -433,7 +433,7 @@ class _FreeDecay:
         """
         most_steps, enough = (SELECTION.few_steps, ORDER.decided) if decide else (FIT.most_steps, FIT.negligible)
         if poles.size:
-            poles, fits, *_ = search(
+            poles, fits, *_ = fitted_poles(
                 self.records, poles, weights, True, most_steps, enough=enough, time_limit=self.time_limit
             )
         else:

@@ -308,7 +308,7 @@ def refine(
     steps = 0
     for _ in range(2):
         # Noise differs between sensors and between records: it is estimated at the first optimum.
-        poles, fit, converged, taken = search(records, poles, weights, offset, time_limit=time_limit)
+        poles, fit, converged, taken = fitted_poles(records, poles, weights, offset, time_limit=time_limit)
         steps += taken
         noise = noise_level(records, fit, weights)
         weights = 1.0 / noise
@@ -356,7 +356,7 @@ def modal_amplitudes(record: Record, modes: SampledModes) -> SampledModes:
     return replace(modes, shapes=fit.complex_amplitudes * lag / modes.poles ** derivative[:, None])
 
 
-def search(
+def fitted_poles(
     records: Sequence[Record],
     poles: np.ndarray,
     weights: np.ndarray,

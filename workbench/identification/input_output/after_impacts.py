@@ -118,5 +118,5 @@ def _significant(refined: Refined, by_amplitude: AmplitudeDependence) -> AfterIm
             scatter.append(float(omega.std()))
     if not changing:
         return AfterImpacts()
-    figures = tuple(by_amplitude.figures(r) for r in changing)
+    figures = tuple(by_amplitude.as_text(r) for r in changing)
     return AfterImpacts(tuple(poles.tolist()), tuple(poles[changing].tolist()), tuple(scatter), figures)
