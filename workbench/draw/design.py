@@ -11,7 +11,6 @@ from workbench.design.spillover.explain import Explanation
 from workbench.design.spillover.spillover import Spillover
 from workbench.draw.style import COLOURS, GREY, MOST_TICKS, few_ticks, grouped_bars, new_figure, prefixed
 from workbench.records.units import SI, Units
-from workbench.structure.printed import place_text
 
 SHOWN_SHARE = 1e-5
 MOST_INSTANTS = 700  # drawn over time, about the number of pixel columns
@@ -122,7 +121,7 @@ def plot_spillover_paths(explained: Explanation) -> Figure:
     axes[0].set_title("real part of residual poles (above 0: unstable)")
     axes[0].legend()
     worst = explained.shifts[0]
-    labels = [f"sensor at {place_text(p.sensor_at)} → {p.actuator}" for p in worst.paths] + ["all paths"]
+    labels = [*(p.text for p in worst.paths), "all paths"]
     shifts = np.array([p.shift.real for p in worst.paths] + [worst.shift.real])
     rows = np.arange(len(labels))[::-1]
     axes[1].barh(rows, shifts, color=[COLOURS[1] if s > 0 else COLOURS[0] for s in shifts])

@@ -95,7 +95,7 @@ def plot_surface_bands(bands: Bands) -> Figure:
         figure.colorbar(share, ax=bottom, location="bottom", shrink=0.9, ticks=MaxNLocator(4))
         for ax in (top, bottom):
             ax.set(aspect="equal", xticks=[], yticks=[])
-    grid[0, 0].set_ylabel("identified φ(x, y)")
+    grid[0, 0].set_ylabel("identified φ(x, y)\n[1/√kg]")
     grid[1, 0].set_ylabel("standard error\n[% of the largest]")
     return figure
 
