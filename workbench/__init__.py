@@ -1,7 +1,7 @@
 """A workbench for the control of flexible structures.
 
 structure → modes → rig → law → response → work → placement        design
-record    → modes → structure                                       identification: the same types, backwards
+record    → modes → structure                                       identification: the inverse problem
 rig + records → gap → effects → a better rig                        diagnosis
 """
 

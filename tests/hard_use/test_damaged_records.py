@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from workbench.cli.app import app
 from workbench.records.files import read_record, write_record
-from workbench.records.limits import Limits, RecordFileError
+from workbench.records.limits import ReadLimits, RecordFileError
 from workbench.records.record import Channel, Record
 from workbench.study.pages.look import look_at
 
@@ -297,11 +297,11 @@ def test_lines_that_hold_nothing_take_no_time(tmp_path, filler):
     """300 MB of them within the limit of 10 s; here a tenth within a tenth."""
     path = tmp_path / "x.csv"
     path.write_text("time,a\n0,1\n" + filler * (30_000_000 // len(filler)) + "0.5,2\n")
-    np.testing.assert_array_equal(read_record(path, limits=Limits(seconds=1.0)).outputs, [[1.0, 2.0]])
+    np.testing.assert_array_equal(read_record(path, limits=ReadLimits(seconds=1.0)).outputs, [[1.0, 2.0]])
 
 
 def test_a_table_of_too_many_rows_is_refused_where_they_are_counted(tmp_path):
-    path, limits = tmp_path / "x.csv", Limits(memory=2**22)
+    path, limits = tmp_path / "x.csv", ReadLimits(memory=2**22)
     path.write_text("time,a\n" + "0.5,1\n" * 300_000)
     with pytest.raises(RecordFileError, match=f"at most {limits.most_numbers} are read"):
         read_record(path, limits=limits)
@@ -340,7 +340,7 @@ def test_a_reader_that_crashes_hangs_or_devours_is_survived(tmp_path, monkeypatc
 
     (tmp_path / "hostile_reader.py").write_text(body)
     monkeypatch.setattr(confined, "ROOT", str(tmp_path))
-    path, limits = tmp_path / "x.mat", Limits(seconds=1.0)
+    path, limits = tmp_path / "x.mat", ReadLimits(seconds=1.0)
     path.write_bytes(b"x")
     if words is None:
         assert confined.load_confined("hostile_reader", path, limits) == {}  # no pickles

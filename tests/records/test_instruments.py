@@ -11,7 +11,7 @@ from scipy.io import wavfile
 
 from workbench.records import csv_file, limits
 from workbench.records.files import read_measured, read_record
-from workbench.records.limits import Limits, RecordFileError
+from workbench.records.limits import ReadLimits, RecordFileError
 from workbench.records.units import LIKELY, split_unit, unit_named
 
 G = 9.80665  # m/s^2, by definition
@@ -434,13 +434,13 @@ def test_sound_files(tmp_path):
 
 def test_limits_are_the_callers(tmp_path):
     text = "t,a\n" + "".join(f"{k},1\n" for k in range(1000))
-    assert read(tmp_path, text, limits=Limits(memory=2000 * 32)).n_samples == 1000
+    assert read(tmp_path, text, limits=ReadLimits(memory=2000 * 32)).n_samples == 1000
     with pytest.raises(RecordFileError, match="holds 2000 numbers; at most 1999"):
-        read(tmp_path, text, limits=Limits(memory=1999 * 32))
+        read(tmp_path, text, limits=ReadLimits(memory=1999 * 32))
     with pytest.raises(RecordFileError, match="more than 1e-06 s to read"):
-        read(tmp_path, text, limits=Limits(seconds=1e-6))
+        read(tmp_path, text, limits=ReadLimits(seconds=1e-6))
     with pytest.raises(ValueError, match="memory must be positive"):
-        Limits(memory=0.0)
+        ReadLimits(memory=0.0)
 
 
 @pytest.mark.parametrize(("each", "blocks"), [(0.05, None), (0.3, 8), (0.11, 80)])
@@ -470,6 +470,6 @@ def test_a_file_that_would_hold_too_many_numbers_is_refused_before_they_are_read
     monkeypatch.setattr(csv_file, "_numbers", counted)
     text = "t,a\n" + "".join(f"{k:07d},1\n" for k in range(10_000))
     with pytest.raises(RecordFileError, match="at most 17000 are read"):
-        read(tmp_path, text, limits=Limits(memory=17_000 * 32))
+        read(tmp_path, text, limits=ReadLimits(memory=17_000 * 32))
     assert sum(map(np.size, read_so_far)) < 0.8 * 20_000
-    assert read(tmp_path, text, limits=Limits(memory=20_000 * 32)).n_samples == 10_000
+    assert read(tmp_path, text, limits=ReadLimits(memory=20_000 * 32)).n_samples == 10_000

@@ -64,11 +64,11 @@ def identify(
     """
     from workbench.identification.signal.modal_estimates import HEADINGS
     from workbench.records.files import named_by_file, read_measured
-    from workbench.records.limits import Limits
+    from workbench.records.limits import ReadLimits
     from workbench.study.pages.identification_report import identification_report
 
     check_target(json_path, page=page)
-    limits = Limits.of_gib(memory)
+    limits = ReadLimits.of_gib(memory)
     with reporting("reading") as report:
         read = [
             named_by_file(

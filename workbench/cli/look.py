@@ -25,12 +25,14 @@ def look(
     Example: workbench look ringdown.csv
     """
     from workbench.records.files import named_by_file, read_measured
-    from workbench.records.limits import Limits
+    from workbench.records.limits import ReadLimits
     from workbench.study.pages.look import HEADINGS, look_at
     from workbench.study.pages.page import write_page
 
     check_target(page=page)
-    measured = read_measured(file, sample_rate_hz=sample_rate_hz, inputs=names_in(inputs), limits=Limits.of_gib(memory))
+    measured = read_measured(
+        file, sample_rate_hz=sample_rate_hz, inputs=names_in(inputs), limits=ReadLimits.of_gib(memory)
+    )
     seen = look_at(named_by_file(measured, file), file)
     shown = replace(seen.page_content, made_by=as_typed())
     say(seen.heading, bold=True)

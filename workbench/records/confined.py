@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from workbench.records.limits import DEFAULT, Limits, RecordFileError, check_counts, unreadable
+from workbench.records.limits import DEFAULT, ReadLimits, RecordFileError, check_counts, unreadable
 
 NAMES = "names"
 REFUSED, NO_MEMORY = 3, 4
@@ -32,7 +32,7 @@ CHILD = (
 ROOT = str(Path(__file__).resolve().parents[2])
 
 
-def load_confined(module: str, path: Path, limits: Limits = DEFAULT) -> dict[str, np.ndarray]:
+def load_confined(module: str, path: Path, limits: ReadLimits = DEFAULT) -> dict[str, np.ndarray]:
     """The arrays that `load(path, limits)` of a module reads from a file, by name, in order.
 
     Raises:
@@ -81,7 +81,7 @@ def serve(module: str, name: str, memory: str, seconds: str) -> None:
     """Read in this process, write the arrays, or the reason of a failure, to its output, and exit."""
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # some readers print
-    limits, path = Limits(float(memory), float(seconds)), Path(name)
+    limits, path = ReadLimits(float(memory), float(seconds)), Path(name)
     _confine(limits)
     try:
         arrays = {key: np.asarray(values) for key, values in import_module(module).load(path, limits).items()}
@@ -100,7 +100,7 @@ def serve(module: str, name: str, memory: str, seconds: str) -> None:
     os._exit(code)  # without the clean-up of libraries, which a damaged file may have corrupted
 
 
-def _confine(limits: Limits) -> None:
+def _confine(limits: ReadLimits) -> None:
     try:
         import resource
     except ImportError:  # Windows has no such limits; the limit of elapsed time applies there too

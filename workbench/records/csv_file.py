@@ -19,7 +19,7 @@ import numpy as np
 
 from workbench.records.assembly import Signals
 from workbench.records.instants import in_seconds
-from workbench.records.limits import DEFAULT, Deadline, Limits, RecordFileError, check_counts
+from workbench.records.limits import DEFAULT, Deadline, ReadLimits, RecordFileError, check_counts
 from workbench.records.table_layout import (
     FORTRAN,
     LONGEST_LINE,
@@ -42,7 +42,7 @@ SAME = 1e-9  # of the record's length: tolerance of two equal columns of instant
 COUNTERS = ("sample", "samples", "index", "n", "no", "no.", "nr", "nr.", "#", "scan", "point", "row")  # before the time
 
 
-def read(path: Path, limits: Limits = DEFAULT) -> Signals:
+def read(path: Path, limits: ReadLimits = DEFAULT) -> Signals:
     """The signals of a table, with units in brackets after the names.
 
     Raises:
@@ -96,7 +96,7 @@ def write(path: Path, time: np.ndarray, signals: Mapping[str, np.ndarray], heade
         writer.writerows(zip(*(map(repr, map(float, column)) for column in (time, *signals.values())), strict=True))
 
 
-def _blocks(path: Path, file: TextIOWrapper, layout: Layout, limits: Limits) -> Iterator[np.ndarray]:
+def _blocks(path: Path, file: TextIOWrapper, layout: Layout, limits: ReadLimits) -> Iterator[np.ndarray]:
     """The numbers of the table in blocks (n_rows, n_columns), time stamps as seconds since the first."""
     deadline, clock = Deadline(path, limits), Clock(path)
     number, rest = layout.first[0], layout.first[1] + "\n"

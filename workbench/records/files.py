@@ -12,7 +12,7 @@ from types import ModuleType
 
 from workbench.records import csv_file, hdf5_file, mat_file, npz_file, tdms_file, uff_file, wav_file
 from workbench.records.assembly import KEY, checksum, facts_of, legible, record_of
-from workbench.records.limits import DEFAULT, Limits, RecordFileError, check_file, reading
+from workbench.records.limits import DEFAULT, ReadLimits, RecordFileError, check_file, reading
 from workbench.records.named_arrays import signals_of
 from workbench.records.record import Record
 from workbench.records.transfer_arrays import complex_columns, holds_transfer, transfer_of
@@ -45,7 +45,7 @@ def read_record(
     sample_rate_hz: float | None = None,
     inputs: tuple[str, ...] = (),
     input_hold: str | None = None,
-    limits: Limits = DEFAULT,
+    limits: ReadLimits = DEFAULT,
     units: Units = SI,
 ) -> Record:
     """A record from a file, whose suffix selects the format.
@@ -59,7 +59,7 @@ def read_record(
         inputs: names of the input signals, where the file does not say.
         input_hold: "zero", "first" or "band-limited", the course of inputs between samples; by default as the file
             says, else "zero". Files of other programs do not say.
-        limits: of memory and processor time.
+        limits: of memory and processor time, `records.limits.ReadLimits`: 1 GiB and 10 s by default.
         units: of the signals, such as those of a case; numbers without a stated unit are not converted.
 
     Raises:
@@ -84,7 +84,7 @@ def read_measured(
     inputs: tuple[str, ...] = (),
     outputs: tuple[str, ...] = (),
     input_hold: str | None = None,
-    limits: Limits = DEFAULT,
+    limits: ReadLimits = DEFAULT,
     units: Units = SI,
 ) -> Record | TransferFunctions:
     """The contents of a file: a record, or transfer functions where the data are complex.

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 from workbench.records.confined import load_confined
-from workbench.records.limits import BYTES_PER_NUMBER, Limits, RecordFileError, check_counts
+from workbench.records.limits import BYTES_PER_NUMBER, ReadLimits, RecordFileError, check_counts
 from workbench.records.named_arrays import HEADER, check_struct, numbered
 from workbench.records.transfer_arrays import PLACES
 from workbench.records.units import time_factor, time_unit, unit_named
@@ -22,7 +22,7 @@ MATLAB_COMPLEX = ("real", "imag")  # fields of MATLAB's complex numbers; those o
 arrays = partial(load_confined, __name__)  # (path, limits) -> arrays by name, by `load` in a separate process
 
 
-def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
+def load(path: Path, limits: ReadLimits) -> dict[str, np.ndarray]:
     """The numbers and texts in the file and its header, sizes checked first; to be called in a separate process."""
     with h5py.File(path, "r") as file:
         held = _held(file)

@@ -43,7 +43,7 @@ def reading(path: Path) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Limits:
+class ReadLimits:
     """Limits of memory and time for reading a file.
 
     Attributes:
@@ -60,7 +60,7 @@ class Limits:
                 raise ValueError(f"the limit of {name} must be positive; got {getattr(self, name)}")
 
     @classmethod
-    def of_gib(cls, memory: float) -> "Limits":
+    def of_gib(cls, memory: float) -> "ReadLimits":
         """Limits with a memory in GiB and the default time."""
         return cls(memory=memory * 2.0**30)
 
@@ -70,13 +70,13 @@ class Limits:
         return int(self.memory / (COPIES * BYTES_PER_NUMBER))
 
 
-DEFAULT = Limits()
+DEFAULT = ReadLimits()
 
 
 class Deadline:
     """The time limit of reading a file, from the creation of this object."""
 
-    def __init__(self, path: Path, limits: Limits) -> None:
+    def __init__(self, path: Path, limits: ReadLimits) -> None:
         self._path, self._seconds = path, limits.seconds
         self._begun = time.process_time()
 
@@ -114,14 +114,14 @@ def check_file(path: Path) -> None:
         )
 
 
-def check_counts(path: Path, n_channels: int, n_numbers: int, limits: Limits = DEFAULT, share: float = 1.0) -> None:
+def check_counts(path: Path, n_channels: int, n_numbers: int, limits: ReadLimits = DEFAULT, share: float = 1.0) -> None:
     """Refuse, by a `RecordFileError`, more channels than `MOST_CHANNELS` or more numbers than the memory allows.
 
     Args:
         path: of the file.
         n_channels: in the whole file.
         n_numbers: in a share of the file.
-        limits: see `Limits`.
+        limits: see `ReadLimits`.
         share: of the file; the rest is extrapolated.
     """
     if n_channels > MOST_CHANNELS:

@@ -11,14 +11,14 @@ from scipy.io import loadmat, savemat, whosmat
 
 from workbench.records import hdf5_file
 from workbench.records.confined import load_confined
-from workbench.records.limits import Limits, check_counts
+from workbench.records.limits import ReadLimits, check_counts
 from workbench.records.named_arrays import HEADER, check_struct, numbered
 
 NUMERIC = ("double", "single", "logical", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)))
 arrays = partial(load_confined, __name__)  # (path, limits) -> arrays by name, by `load` in a separate process
 
 
-def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
+def load(path: Path, limits: ReadLimits) -> dict[str, np.ndarray]:
     """The arrays of numbers and texts in the file, sizes checked first; to be called in a separate process."""
     if hdf5_file.is_hdf5(path):
         return hdf5_file.load(path, limits)
@@ -33,7 +33,7 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
     return _fields(path, structs, limits) | found
 
 
-def _fields(path: Path, names: list[str], limits: Limits) -> dict[str, np.ndarray]:
+def _fields(path: Path, names: list[str], limits: ReadLimits) -> dict[str, np.ndarray]:
     """The numbers and texts in the one struct of a file; its size is known only once it is read."""
     structs = loadmat(path, appendmat=False, variable_names=names)
     only = structs[names[0]]

@@ -10,14 +10,14 @@ from typing import IO, Any
 import numpy as np
 from numpy.lib import format as npy
 
-from workbench.records.limits import DEFAULT, Deadline, Limits, RecordFileError, check_counts, reading
+from workbench.records.limits import DEFAULT, Deadline, ReadLimits, RecordFileError, check_counts, reading
 from workbench.records.named_arrays import HEADER
 
 ENDING = ".npy"
 LONGEST_TEXT = 2**22  # characters
 
 
-def arrays(path: Path, limits: Limits = DEFAULT) -> dict[str, np.ndarray]:
+def arrays(path: Path, limits: ReadLimits = DEFAULT) -> dict[str, np.ndarray]:
     """The arrays of an archive, read after a check of the sizes that their headers declare.
 
     Raises:

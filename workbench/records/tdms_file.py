@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from workbench.records.confined import load_confined
-from workbench.records.limits import Limits, RecordFileError, check_counts
+from workbench.records.limits import ReadLimits, RecordFileError, check_counts
 
 LEAD_IN, BIG_ENDIAN = 28, 1 << 6  # bytes before each segment; the flag in them of its byte order
 TOGETHER = 0.01  # of a step: tolerance of the start times of channels
@@ -39,7 +39,7 @@ def _check_whole(path: Path) -> None:
         raise RecordFileError(f"{path} ends within its last segment: it was cut short, or is still being written")
 
 
-def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
+def load(path: Path, limits: ReadLimits) -> dict[str, np.ndarray]:
     """The channels of numbers, with units in brackets after their names, and `t` where the file has sample instants.
 
     Sizes are checked first; to be called in a separate process.

@@ -12,7 +12,7 @@ import pyuff
 
 from workbench.records.assembly import unit_remark
 from workbench.records.confined import load_confined
-from workbench.records.limits import Limits, RecordFileError
+from workbench.records.limits import ReadLimits, RecordFileError
 from workbench.records.named_arrays import HEADER
 from workbench.records.transfer_arrays import description
 from workbench.records.units import BY_QUANTITY, UNITS, unit_named
@@ -35,7 +35,7 @@ OURS = ('{"kind"', '"kind":', '"name":')
 arrays = partial(load_confined, __name__)  # (path, limits) -> arrays by name, by `load` in a separate process
 
 
-def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
+def load(path: Path, limits: ReadLimits) -> dict[str, np.ndarray]:
     """The signals of all data sets 58, their instants and their header; to be called in a separate process."""
     if not _whole(path.read_bytes()):
         raise RecordFileError(f"{path} is damaged: its last data set has no end")

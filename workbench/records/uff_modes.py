@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from workbench.records.confined import load_confined
-from workbench.records.limits import Limits, RecordFileError
+from workbench.records.limits import ReadLimits, RecordFileError
 from workbench.records.uff_file import data_sets
 
 NORMAL_MODE = 2  # analysis_type of both formats
@@ -23,7 +23,7 @@ DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 arrays = partial(load_confined, __name__)  # (path, limits) -> arrays by name, by `load` in a separate process
 
 
-def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
+def load(path: Path, limits: ReadLimits) -> dict[str, np.ndarray]:
     """Frequencies, damping, modal masses and shapes at nodes; to be called in a separate process."""
     sets = data_sets(path)
     modes = [_of_55(s) if s["type"] == 55 else _of_2414(s) for s in sets if _is_mode(path, s)]

@@ -8,12 +8,12 @@ import numpy as np
 from scipy.io import wavfile
 
 from workbench.records.confined import load_confined
-from workbench.records.limits import Limits, RecordFileError, check_counts
+from workbench.records.limits import ReadLimits, RecordFileError, check_counts
 
 arrays = partial(load_confined, __name__)  # (path, limits) -> arrays by name, by `load` in a separate process
 
 
-def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
+def load(path: Path, limits: ReadLimits) -> dict[str, np.ndarray]:
     """Sample instants `t` and the channels, by name; to be called in a separate process."""
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="Reached EOF prematurely")  # refuses a truncated file
