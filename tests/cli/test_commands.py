@@ -210,7 +210,7 @@ def test_design_has_observers_of_rigid_modes_and_says_what_is_on_the_axis(tmp_pa
 def test_design_offers_what_can_be_had(rig, tmp_path):
     found = tmp_path / "design.json"
     nodes = run("design", rig, "--control", 5)
-    assert nodes.exit_code == 2 and "mode 5 is uncontrollable: all actuators stand at its nodes" in nodes.output
+    assert nodes.exit_code == 2 and "mode 5 is uncontrollable: all actuators are at its nodes" in nodes.output
     rig.write_text(rig.read_text().replace("at = 4.0", "at = 4.3"))
     few = run("design", rig, "--control", 5, "--damping", 0.1, "--errors", 0.02, "--json", found)
     assert "stable of 100 models with 2 % error" in few.output

@@ -127,7 +127,7 @@ def test_a_damaged_verdict_is_named(run, case, tmp_path, change, said):
         ("--criterion", "fast", "cost or settling; got 'fast'"),
         ("--impulse-at", 9.0, "lies outside the structure"),
         ("--impulse-at", "F9", "or name an input: F1, F2"),
-        ("--impulse-at", 0, "moves none of the controlled modes"),
+        ("--impulse-at", 0, "excites none of the controlled modes"),
         ("--control", 7, "controlled modes is 1 to 5, those of the model; got 7"),
         ("--to", "anew.m", ".c, .py or .mat"),
         ("--to", "no/anew.c", "make it first"),

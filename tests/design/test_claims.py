@@ -107,7 +107,7 @@ def test_sensors_of_a_filter_placed():
     best = place_sensors(found, 3, 3, 1.0, mean_squares=squares, candidates=few)
     every = [filter_error(found, range(3), [few[0], few[3], x], 1.0, squares) for x in few[4:]]
     assert best.exhaustive and best.error <= min(every)
-    with pytest.raises(DesignError, match="8 sensors cannot stand at 7"):
+    with pytest.raises(DesignError, match="8 sensors cannot be at 7"):
         place_sensors(found, 3, 8, 1.0, mean_squares=squares, candidates=few)
     with pytest.warns(DeprecationWarning, match="mass="):
         former = place_sensors(found, 3, 3, mass_per_length=1.0, mean_squares=squares, candidates=few)

@@ -351,7 +351,7 @@ def test_state_space_names_and_lags():
 
 
 def test_an_actuator_on_a_support_is_refused():
-    with pytest.raises(ValueError, match="stands on the support"):
+    with pytest.raises(ValueError, match="is on the support"):
         state_space(beam().modes(2), (Actuator("F1", 0.0),), (Sensor("y", 3.0),))
 
 

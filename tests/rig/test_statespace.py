@@ -80,7 +80,7 @@ def test_frequency_response_is_the_modal_sum(modes, quantity, lags):
 
 
 def test_an_actuator_on_a_support_is_refused_by_name(modes):
-    with pytest.raises(ValueError, match="actuator F stands on the support at x = 2"):
+    with pytest.raises(ValueError, match="actuator F is on the support at x = 2"):
         input_matrix(modes, [Actuator("F", 2.0)])
     assert np.abs(input_matrix(modes, [Actuator("M", 2.0, quantity="moment")])).min() > 0.1
 

@@ -489,7 +489,7 @@ def test_what_cannot_be_redesigned_is_named(rig, controller):
         redesign(plain, controller, sample_time=0.0)
     with pytest.raises(ValueError, match="x = 7 lies outside the structure"):
         redesign(plain, controller, sample_time=DT, impulse_at=7.0)
-    with pytest.raises(DesignError, match="moves none of the controlled modes"):
+    with pytest.raises(DesignError, match="excites none of the controlled modes"):
         redesign(plain, controller, sample_time=DT, impulse_at=0.0)
     heard = replace(rig, sensors=(Sensor("a", 0.5, "acceleration"),))
     with pytest.raises(DesignError, match="observers here do not use accelerations"):

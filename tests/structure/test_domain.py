@@ -136,7 +136,7 @@ def test_sizes_separations_and_texts():
         (lambda: Interval(0.0), "must be positive"),
         (lambda: Rectangle((1.0, -2.0)), "must be positive"),
         (lambda: plate().phi((0.1, 0.2), 2), "a derivative on a plate is 0, 1, or a pair of orders .*; got 2"),
-        (lambda: input_matrix(plate(), [Actuator("F", (0.0, 0.3))]), "stands on the support"),
+        (lambda: input_matrix(plate(), [Actuator("F", (0.0, 0.3))]), "is on the support"),
         (lambda: of_rig(plate(), (1.3, 0.2), (0.3, 0.2)), r"actuator F: \(x, y\) = \(1.3, 0.2\) lies outside"),
         (
             lambda: of_rig(plate(), (0.3, 0.2), (0.3, 1.2)),

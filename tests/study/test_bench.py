@@ -144,7 +144,7 @@ def test_sensors_close_the_loop_through_modal_filters():
         ({"weight": [1.0, 1.0, 1.0]}, "each of the 4 controlled modes"),
         ({"weight": [1.0, 1.0, 1.0, 0.0]}, "positive"),
         ({"weight": [1.0, 1.0, 1.0, float("nan")]}, "finite numbers; got nan"),
-        ({"actuators": [2.0, 2.0, 6.0, 8.0]}, "both stand at x = 2"),
+        ({"actuators": [2.0, 2.0, 6.0, 8.0]}, "are both at x = 2"),
         ({"actuators": [2.0] * 41}, "at most 40"),
         ({"actuators": ["a", 2.0, 6.0, 8.0]}, "a position x in m; got 'a'"),
         ({"impulse_at": 11.0}, "outside the structure"),
@@ -184,7 +184,7 @@ def test_a_design_on_a_plate_is_what_the_library_makes_of_it(plate):
         ({"actuators": [[0.3, 0.24], [1.3, 0.5]]}, "1.3.* 0 to 1.2 by 0 to 0.8"),
         ({"actuators": [0.3, [0.8, 0.5]]}, "a place is a pair .* m; got 0.3"),
         ({"impulse_at": 0.3}, "a place is a pair .* m; got 0.3"),
-        ({"sensors": [[0.3, 0.2], [0.3, 0.2]]}, "two of the 2 sensors stand at one place"),
+        ({"sensors": [[0.3, 0.2], [0.3, 0.2]]}, "two of the 2 sensors are at one place"),
     ],
 )
 def test_what_makes_no_design_on_a_plate_is_refused(change, words, tmp_path):

@@ -47,7 +47,7 @@ def _input_matrix(modes: Modes, actuators: Sequence[Actuator]) -> Floats:
         shape = shape_of(modes, actuator)
         if modes.is_held(actuator.at, int(actuator.quantity == "moment"), direction=actuator.direction):
             raise ValueError(
-                f"actuator {actuator.name} stands on the support at {modes.domain.text(actuator.at)}, where it moves"
+                f"actuator {actuator.name} is on the support at {modes.domain.text(actuator.at)}, where it moves"
                 " no mode; move it inside"
             )
         columns.append(actuator.gain * shape)

@@ -35,7 +35,7 @@ def impulse_test(
         rig: nominal.
         controlled: zero-based modes.
         sample_time: s.
-        impulse_at: the place; by default that of a hammer or of the first actuator. If that moves none of the
+        impulse_at: the place; by default that of a hammer or of the first actuator. If that excites none of the
             controlled modes, as at a clamp turned by a motor, the place where all of them move most.
         level: (n_outputs,) peak readings of the nominal rig without control, to which the impulse is scaled (by the
             median of the sensors); None for a unit impulse.
@@ -82,7 +82,7 @@ def _impulse_place(rig: Rig, controlled: Sequence[int], given: Where | None) -> 
         return at
     if given is not None:
         raise DesignError(
-            f"an impulse at {rig.modes.domain.text(at)} moves none of the controlled modes, so it tests no"
+            f"an impulse at {rig.modes.domain.text(at)} excites none of the controlled modes, so it tests no"
             " controller; choose another place"
         )
     moved = shapes[:, list(controlled)]

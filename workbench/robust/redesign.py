@@ -76,7 +76,7 @@ def redesign(
         progress: called with (text, share done).
 
     Raises:
-        DesignError: a controller that does not fit the rig, a rate too slow for the modes, an impulse that moves none
+        DesignError: a controller that does not fit the rig, a rate too slow for the modes, an impulse that excites none
             of them, or modes that cannot be controlled on the corrected rig.
         TypeError: no verdict, no design, no test, or an argument that is no number.
         ValueError: an impulse outside the structure, no draws, an unknown criterion, or a share below zero.

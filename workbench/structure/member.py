@@ -92,7 +92,7 @@ class _Member(Printed):
             if not isinstance(part.at, float):
                 raise ValueError(f"{part}: a place along a bar or beam is a position x, m; got {part.at!r}")
             if not 0 <= part.at <= self.length:
-                raise ValueError(f"{part} stands outside the structure, which runs from 0 to {self.length:g}")
+                raise ValueError(f"{part} is outside the structure, which runs from 0 to {self.length:g}")
             if isinstance(part, PointMass) and (part.mass < 0 or part.rotary_inertia < 0):
                 raise ValueError(f"{part}: a mass cannot be negative; leave it out or lower mass_per_length")
 
@@ -385,7 +385,7 @@ class Bar(_Member):
             on_end = abs(at - end) < NO_SLIVER * self.length and isinstance(part, PointSpring | PointMass)
             if on_end and self._is_tip(end):
                 raise ValueError(
-                    f"{part} stands on a tip: axial_stiffness vanishes at x = {end:g}, where a point force has an"
+                    f"{part} is on a tip: axial_stiffness vanishes at x = {end:g}, where a point force has an"
                     " infinite displacement; attach it further in, or give the tip some stiffness"
                 )
 

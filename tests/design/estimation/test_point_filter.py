@@ -93,7 +93,7 @@ def test_a_filter_is_tried_where_only_points_are_known():
     ("points", "words"),
     [
         (["P2", "P6"], "a filter of 3 modes at named points needs at least as many sensors; got 2: add sensors"),
-        (["P2", "P6", "P2"], "two of the 3 sensors stand at point P2; move one"),
+        (["P2", "P6", "P2"], "two of the 3 sensors are at point P2; move one"),
         (["P4", "P8", "P12"], "no point 'P12'"),
     ],
 )

@@ -92,7 +92,7 @@ def test_a_filter_of_a_beam_takes_its_sensors_in_any_order():
     [
         ([(0.3, 0.2), (0.9, 0.6)], "a filter of 3 modes on a plate needs at least as many sensors; got 2: add sensors"),
         ([(0.3, 0.2), (0.6, 0.4), (0.9, 0.6)], "not on one line; got 3"),
-        ([(0.3, 0.2), (0.3, 0.2), (0.9, 0.6)], "two of the 3 sensors stand at one place"),
+        ([(0.3, 0.2), (0.3, 0.2), (0.9, 0.6)], "two of the 3 sensors are at one place"),
         ([(0.3, 0.2), (1.3, 0.4), (0.9, 0.6)], r"\(1.3, 0.4\) lies outside the structure"),
     ],
 )

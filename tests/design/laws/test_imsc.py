@@ -115,8 +115,8 @@ def test_a_state_of_another_size_starts_no_response():
 @pytest.mark.parametrize(
     ("act", "words"),
     [
-        (lambda: imsc(modes(), 2, actuators(2.0, 2.0), weight=1.0), "F1 and F2 both stand at x = 2"),
-        (lambda: imsc(modes(), 1, actuators(0.0), weight=1.0), "stands on the support"),
+        (lambda: imsc(modes(), 2, actuators(2.0, 2.0), weight=1.0), "F1 and F2 are both at x = 2"),
+        (lambda: imsc(modes(), 1, actuators(0.0), weight=1.0), "is on the support"),
         (lambda: imsc(modes(), 3, actuators(2.0, 4.0), weight=1.0), "3 controlled modes need as many actuators"),
         (lambda: imsc(modes(), 2, actuators(5.0, 1.0), weight=-1.0), "weight R must be positive"),
         (lambda: imsc_poles(modes(), 1, actuators(2.0), poles=[0.1 + 1j]), "not stable"),

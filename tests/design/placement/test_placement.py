@@ -435,7 +435,7 @@ def test_a_zone_up_to_an_end_leaves_no_place_at_the_end():
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"impulse_at": 0.0}, "an impulse at 0.0 moves no mode"),
+        ({"impulse_at": 0.0}, "an impulse at 0.0 excites no mode"),
         ({"impulse": np.nan}, "the impulse must be finite and not 0, N s; got nan"),
         ({"weight": [1.0, 2.0]}, "R is one number, or one per mode: 4 modes need as many; got 2"),
     ],

@@ -253,7 +253,7 @@ def test_no_reply_is_learnt_where_no_other_record_has_inputs(rig, measured):
 
 
 def test_a_gap_above_the_last_mode_is_of_no_mode(hinged_rig, measured):
-    """Modes 3 and 4 of the real beam stand at 9 and 16 times the first, the model has two."""
+    """Modes 3 and 4 of the real beam are at 9 and 16 times the first, the model has two."""
     found = where(hinged_rig(2), [measured(hinged_rig(4), str(level), level, 3) for level in (0.1, 1.0)])
     assert found.share_above > 0.9
     assert found.mode_shares.sum() + found.share_above == pytest.approx(1.0)

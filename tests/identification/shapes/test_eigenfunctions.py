@@ -150,11 +150,11 @@ def test_refusals():
     held = BoundaryConditions.of("beam", length=2.0, left="hinged", right="hinged")
     with pytest.raises(ValueError, match="condition holds at x = 2, which is no end of the structure, 0 to"):
         eigenfunctions(modes, length=1.6, ends=held)
-    with pytest.raises(ValueError, match="all sensors stand at ends that hold the value at zero; add one between"):
+    with pytest.raises(ValueError, match="all sensors are at ends that hold the value at zero; add one between"):
         eigenfunctions(SampledModes([1.0], [0.0], [[0.1], [0.5]], [0.0, 2.0]), length=2.0, ends=held)
     with pytest.raises(ValueError, match=r"mass_per_length is -1 at x = 1\.\d+; it must be 0 or more"):
         eigenfunctions(modes, length=2.0, degree=1, mass_per_length=lambda x: np.where(x < 1.0, 1.0, -1.0))
-    with pytest.raises(ValueError, match="two sensors stand at"):
+    with pytest.raises(ValueError, match="two sensors are at"):
         eigenfunctions(SampledModes([1.0], [0.0], [[1.0], [0.5]], [0.5, 0.5]), length=1.0, degree=1)
     with pytest.raises(ValueError, match="has no place"):
         eigenfunctions(SampledModes([1.0], [0.0], [[1.0], [0.5]], [0.5, np.nan]), length=1.0, degree=1)

@@ -133,7 +133,7 @@ def test_what_cannot_be_drawn_is_refused(plate):
     with pytest.raises(ValueError, match="10 sensors determine a cubic over the rectangle and nothing beyond"):
         SurfaceSpline(Rectangle(LENGTH), scattered(10)).roughness(np.ones(10), np.eye(10))
     places = scattered(20)
-    with pytest.raises(ValueError, match="sensors 1 and 20 stand at one place"):
+    with pytest.raises(ValueError, match="sensors 1 and 20 are at one place"):
         SurfaceSpline(Rectangle(LENGTH), np.vstack([places[:19], places[:1]]))
     with pytest.raises(ValueError, match="got middle 'clamped'"):
         SurfaceSpline(Rectangle(LENGTH), places, {"middle": "clamped"})

@@ -155,7 +155,7 @@ def point_filter(modes: Modes, points: Sequence[str], filtered: Sequence[int]) -
     modes.select(index)  # refuses an index without a mode
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise ValueError(f"two of the {len(names)} sensors stand at point {twice}; move one")
+        raise ValueError(f"two of the {len(names)} sensors are at point {twice}; move one")
     if len(names) < len(index):
         raise ValueError(
             f"a filter of {len(index)} modes at named points needs at least as many sensors; got {len(names)}: add"
@@ -229,7 +229,7 @@ def surface_filter(modes: Modes, places: ArrayLike, mass_per_area: FieldLike) ->
         raise ValueError(f"a filter by thin-plate splines is for a plate or a membrane; these modes are of {domain}")
     at = domain.locate(places)
     if len(np.unique(at, axis=0)) < len(at):
-        raise ValueError(f"two of the {len(at)} sensors stand at one place; move one")
+        raise ValueError(f"two of the {len(at)} sensors are at one place; move one")
     if len(at) < modes.n_modes:
         raise ValueError(
             f"a filter of {modes.n_modes} modes on a plate needs at least as many sensors; got {len(at)}: add sensors,"

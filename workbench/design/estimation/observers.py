@@ -112,7 +112,7 @@ def observed_plant(modes: Modes, law: Law, sensors: Sequence[Sensor]) -> tuple[F
     for j, r in enumerate(index):
         strength = max(np.abs(c[:, j]).max(), np.abs(c[:, n + j]).max())
         if strength <= UNSEEN * grid[j]:
-            raise DesignError(f"mode {r + 1} is unobservable: all sensors stand at its nodes; move or add one")
+            raise DesignError(f"mode {r + 1} is unobservable: all sensors are at its nodes; move or add one")
     # rigid modes are observable through displacements alone, and need as many independent ones as there are modes
     rigid = np.flatnonzero(own.omega == 0)
     rank = int(np.linalg.matrix_rank(c[:, rigid] / grid[rigid], tol=UNSEEN)) if rigid.size else 0

@@ -163,7 +163,7 @@ def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[A
             alike = (first.quantity, first.direction) == (second.quantity, second.direction)
             if alike and separation(modes, first, second) <= 1e-6:
                 raise DesignError(
-                    f"actuators {first.name} and {second.name} both stand at {text(first.at)}, so B is singular;"
+                    f"actuators {first.name} and {second.name} are both at {text(first.at)}, so B is singular;"
                     " move one by more than 1e-6 of the length"
                 )
     raise DesignError(
@@ -205,7 +205,7 @@ def _inputs(modes: Modes, controlled: Sequence[int], actuators: Sequence[Actuato
     relative, possible = b / unit, possible / unit
     for row, most, r in zip(relative, possible, controlled, strict=True):
         if np.abs(row).max() < UNMOVED * most.max():
-            raise DesignError(f"mode {r + 1} is uncontrollable: all actuators stand at its nodes; move one")
+            raise DesignError(f"mode {r + 1} is uncontrollable: all actuators are at its nodes; move one")
     return b, relative
 
 

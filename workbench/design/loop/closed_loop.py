@@ -237,7 +237,7 @@ def close_loop(modes: Modes, law: Law | Controller, filter_: ModalFilter | None 
         if strength.min() < UNSEEN:
             raise ValueError(
                 f"mode {law.controlled[strength.argmin()] + 1} is unobservable: the filter's sensors at"
-                f" {'; '.join(map(place_text, filter_.places))} all stand at its nodes; move or add a sensor"
+                f" {'; '.join(map(place_text, filter_.places))} are all at its nodes; move or add a sensor"
             )
     estimate = np.kron(np.eye(2), output)
     feedback = -law.gain @ estimate

@@ -42,7 +42,7 @@ IPOPT_SAYS = {
     "Solved_To_Acceptable_Level": "converged, to IPOPT's acceptable tolerance",
 }
 OFF_ENDS = 1e-3  # of a side: least distance of IPOPT's places from the ends
-ON_EDGE = 1e-6  # of a side: an actuator nearer to the edge of its box stands on the edge
+ON_EDGE = 1e-6  # of a side: an actuator nearer to the edge of its box is on the edge
 
 
 def nodes_of_mode(modes: Modes, mode: int) -> np.ndarray:

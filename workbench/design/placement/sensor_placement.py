@@ -135,7 +135,7 @@ def place_sensors(
     grid = _candidates(modes, candidates)
     if not 1 <= count <= len(grid):
         raise DesignError(
-            f"{count} sensors cannot stand at {len(grid)} candidate places; place one sensor or more, and give as many"
+            f"{count} sensors cannot be at {len(grid)} candidate places; place one sensor or more, and give as many"
             " candidates"
         )
 

@@ -294,7 +294,7 @@ def placement_task(
         raise DesignError(f"the impulse must be finite and not 0, N s; got {impulse}")
     places = listed(as_places(modes.domain, impulse_at))
     if modes.are_held(places).all():
-        raise DesignError(f"an impulse at {impulse_at} moves no mode: a support holds that place; give another")
+        raise DesignError(f"an impulse at {impulse_at} excites no mode: a support holds that place; give another")
     shares = np.full(len(places), 1.0 / len(places)) if probabilities is None else np.asarray(probabilities, float)
     if shares.shape != (len(places),) or not (shares >= 0).all() or not shares.sum() > 0:
         raise DesignError(f"{len(places)} places need as many probabilities, none negative; got {shares}")

@@ -252,7 +252,7 @@ class Splines:
         each = [(int(d), np.flatnonzero(degrees == d)) for d in np.unique(degrees)]
         groups = tuple((interpolating_spline(sampled.positions, degree=d, **options), modes) for d, modes in each)
         if not any(spline.weights.any() for spline, _ in groups):
-            raise ValueError("all sensors stand at ends that hold the value at zero; add one between the ends")
+            raise ValueError("all sensors are at ends that hold the value at zero; add one between the ends")
         return cls(groups)
 
     def __call__(self, values: np.ndarray, x: np.ndarray, derivative: int = 0) -> np.ndarray:
@@ -318,7 +318,7 @@ def _check_places(positions: np.ndarray, length: float, degree: int) -> None:
     ordered = np.sort(positions)
     coincident = np.diff(ordered) <= 1e-6 * length
     if coincident.any():
-        raise ValueError(f"two sensors stand at x = {ordered[:-1][coincident][0]:g}; keep one of them")
+        raise ValueError(f"two sensors are at x = {ordered[:-1][coincident][0]:g}; keep one of them")
 
 
 def _usable(zeros: Sequence[tuple[float, int]], degree: int, length: float) -> list[tuple[float, int]]:

@@ -108,7 +108,7 @@ class SurfaceSpline:
         gaps = np.linalg.norm(self.places[:, None] - self.places, axis=2) + np.eye(len(self.places)) * self.domain.size
         if gaps.min() < SURFACE.same_place * self.domain.size:
             i, j = np.unravel_index(int(gaps.argmin()), gaps.shape)
-            raise ValueError(f"sensors {i + 1} and {j + 1} stand at one place, {self.places[i]} m; keep one of them")
+            raise ValueError(f"sensors {i + 1} and {j + 1} are at one place, {self.places[i]} m; keep one of them")
         if np.linalg.matrix_rank(self._equations[:, -len(CUBIC) :]) < len(CUBIC):
             raise ValueError(
                 f"{self._used.sum()} sensors and the edges do not determine a cubic over the rectangle, which takes"
