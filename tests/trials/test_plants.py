@@ -45,6 +45,15 @@ def test_thin_elements_do_not_round_off_the_lowest_modes():
     np.testing.assert_allclose(omega, WAVE * (np.arange(1, 4) * np.pi) ** 2, rtol=1e-8)
 
 
+@pytest.mark.parametrize("apart", [3e-3, 3e-4, 5e-5, 1e-5, 1e-7])
+def test_places_close_together_do_not_spoil_the_modes(apart):
+    at = np.array([0.7, 0.7 + 2.0 * apart])  # the matrix of an element is singular where it is a millionth long
+    modes, r = element_modes(_beam(), at, 8), np.arange(1, 9)
+    np.testing.assert_allclose(modes.omega, WAVE * (r * np.pi) ** 2, rtol=2e-7)
+    exact = np.sqrt(2.0 / (3.0 * 2.0)) * np.sin(np.outer(at, r) * np.pi / 2.0)
+    np.testing.assert_allclose(np.abs(modes.shapes), np.abs(exact), rtol=2e-6)
+
+
 @pytest.mark.parametrize(
     ("left", "right", "secular", "brackets"),
     [
