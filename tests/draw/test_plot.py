@@ -79,7 +79,7 @@ def test_an_explanation_at_named_points_is_printed_and_drawn():
         FRAME, wb.kalman_controller(FRAME, law, [wb.Sensor("y", "S3")], disturbance=1.0, noise=0.1)
     )
     assert "  y → F1" in str(explained) and str(explained).startswith("closed loop of 3 modes: ")
-    assert "sensor at S3 → F1" in [label.get_text() for label in plot(explained).axes[1].get_yticklabels()]
+    assert "y → F1" in [label.get_text() for label in plot(explained).axes[1].get_yticklabels()]
     assert "place [m]" not in str(law)
 
 
