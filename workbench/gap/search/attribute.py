@@ -234,7 +234,7 @@ def attribute(
     is_cut = search.is_over
     final_search = own_search or search
     if seen and outcome == "unknown" and start.cost - 1.0 < ATTRIBUTION.very_near * (of_nominal.mean() - 1.0):
-        outcome, best = "explained", start  # nothing explains the little that is left
+        outcome, best, alternatives, noise = "explained", start, (), None  # nothing explains the little that is left
     best = uniform_as_nominal_errors(search, best, alone=random is not None)
     if outcome == "explained" and random is None:
         best = _with_one_for_two(final_search, widened(final_search, best))
