@@ -19,6 +19,8 @@ from workbench.design.spillover.performance import Performance
 from workbench.design.spillover.remedies import Remedy, spillover_remedies
 from workbench.design.spillover.robustness import Robustness
 from workbench.design.spillover.spillover import spillover
+from workbench.gap.effects.catalogue import kind_named
+from workbench.gap.effects.effect import Effect
 from workbench.renamed import Renamed, former_arguments
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
@@ -98,6 +100,14 @@ def test_damping_takes_the_coefficients_of_earlier_versions():
         assert damping.g1 == 0.002
     with pytest.warns(DeprecationWarning, match="ProportionalDamping.g2 is now mass"):
         assert damping.g2 == 0.1
+
+
+def test_an_effect_takes_the_deviations_of_earlier_versions_for_its_standard_errors():
+    with pytest.warns(DeprecationWarning, match=r"Effect\(deviations=...\) is now"):
+        one = Effect(kind_named("modulus_error"), None, {"factor": 1.1}, deviations={"factor": 0.01})
+    assert one.std == {"factor": 0.01}
+    with pytest.warns(DeprecationWarning, match="Effect.deviations is now std"):
+        assert one.deviations is one.std
 
 
 def test_the_matrices_of_a_controller_have_their_former_names_too():

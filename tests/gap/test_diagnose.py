@@ -185,7 +185,7 @@ def test_standard_deviations_are_true():
             for r, p in zip(data.records, clean, strict=True)
         ]
         found = fit(case.rig, (true,), FitData(tuple(noisy), noise)).effects[0]
-        errors.append([(found.values[n] - true.values[n]) / found.deviations[n] for n in ("at", "stiffness")])
+        errors.append([(found.values[n] - true.values[n]) / found.std[n] for n in ("at", "stiffness")])
     spread = np.std(errors, axis=0)
     assert (spread > 0.6).all() and (spread < 1.5).all()
 

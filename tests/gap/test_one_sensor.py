@@ -49,7 +49,7 @@ def test_a_short_record_may_be_a_little_louder_than_its_noise(rig, seed):
     verdict = wb.diagnose(rig, [measured(rig, seed, 160, late=17)])
     (effect,) = verdict.effects
     assert effect.kind.name in ("sensor_delay", "actuator_delay")
-    assert abs(effect.values["delay"] - 1.7 * STEP) < 3.0 * effect.deviations["delay"] < 1e-4
+    assert abs(effect.values["delay"] - 1.7 * STEP) < 3.0 * effect.std["delay"] < 1e-4
     assert len(verdict.alternatives) == 1 and "_delay" in verdict.alternatives[0][0]
 
 

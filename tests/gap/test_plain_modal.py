@@ -173,7 +173,7 @@ def test_a_limit_and_a_gain_are_found_beside_shapes_that_are_off(spacecraft):
     verdict = diagnose(rig, fit, validation=[check], catalogue=kinds, workers=1)
     limit, gain, _ = verdict.effects
     assert (limit.label, gain.label) == ("actuator_saturation[T1]", "sensor_gain[a1]")
-    assert limit.values["limit"] == pytest.approx(25.0, abs=3.0 * limit.deviations["limit"])
+    assert limit.values["limit"] == pytest.approx(25.0, abs=3.0 * limit.std["limit"])
     assert gain.values["gain"] == pytest.approx(1.12, abs=0.03)  # the shapes at it are off by 1.4 % in the mean
     axes, place = plot_where(verdict).axes, verdict.where.place
     shares = [bar.get_height() for bar in axes[0].patches]

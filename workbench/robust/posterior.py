@@ -238,7 +238,7 @@ def _covariance(nominal: Rig, fit: Fit) -> np.ndarray:
     variances = []
     for i, parameter in parameters:
         effect, name = fit.effects[i], parameter.name
-        slope, deviation = parameter.slope(effect.values[name]), effect.deviations.get(name, 0.0)
+        slope, deviation = parameter.slope(effect.values[name]), effect.std.get(name, 0.0)
         variances.append((deviation / slope) ** 2 if slope and np.isfinite(deviation) else 0.0)
     return np.diag(variances)
 
@@ -266,7 +266,7 @@ def _effect_json(effect: Effect) -> dict[str, Any]:
     elif isinstance(target, IdentifiedPrior):
         target = {"identified": target.root.tolist()}
     values = {n: {"between": list(v)} if isinstance(v, Between) else v for n, v in effect.values.items()}
-    return {"kind": effect.kind.name, "target": target, "values": values, "deviations": dict(effect.deviations)}
+    return {"kind": effect.kind.name, "target": target, "values": values, "deviations": dict(effect.std)}
 
 
 def _effect(nominal: Rig, kind: Kind, written: Mapping[str, Any]) -> Effect:

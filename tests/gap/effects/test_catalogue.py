@@ -222,7 +222,7 @@ def test_an_effect_is_unsure_where_a_number_that_is_stated_may_be_nothing():
         {"stiffness": 1.0, "yield_displacement": 1e-7},
     )
     assert joint.stands_out(frame()) and not joint.is_sure(frame())
-    assert replace(joint, deviations={"stiffness": 1.0, "yield_displacement": 1e-9}).is_sure(frame())
+    assert replace(joint, std={"stiffness": 1.0, "yield_displacement": 1e-9}).is_sure(frame())
 
 
 def test_rounding_of_all_sensors_is_described_with_their_unit():

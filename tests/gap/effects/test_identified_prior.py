@@ -66,7 +66,7 @@ def test_an_added_mass_is_as_doubtful_as_the_frequency_it_is_told_by():
         beside = () if prior is None else (nominal_errors(nominal, prior),)
         mass = Effect(kind_named("point_mass"), None, {"at": "y", "mass": 0.03})
         fitted = with_intervals(nominal, fit(nominal, (mass, *beside), data), data, wide=True).effects[0]
-        found[name] = fitted.values["mass"], fitted.deviations["mass"]
+        found[name] = fitted.values["mass"], fitted.std["mass"]
     value, deviation = found["doubtful"]
     assert deviation == pytest.approx(2.0 * MASS * DOUBT, rel=0.25)
     assert abs(value - added) < 1.96 * deviation

@@ -73,7 +73,7 @@ def test_friction_far_below_its_smoothing_speed_is_a_damper():
     assert found.effects[0].kind is friction.kind and not found.effects[0].stands_out(nominal)
     (told,) = _significant(search, found, (), 0.0).effects
     assert told.kind is damper.kind
-    assert told.values["coefficient"] == pytest.approx(0.3, abs=4.0 * told.deviations["coefficient"])
+    assert told.values["coefficient"] == pytest.approx(0.3, abs=4.0 * told.std["coefficient"])
 
 
 def test_friction_as_strong_in_both_directions_is_of_one_force():
@@ -87,7 +87,7 @@ def test_friction_as_strong_in_both_directions_is_of_one_force():
     assert found.effects[0].stands_out(nominal) and found.effects[0].is_sure(nominal)
     (told,) = _significant(search, found, (), 0.0).effects
     assert told.kind is friction.kind
-    assert told.values["force"] == pytest.approx(1.0, abs=4.0 * told.deviations["force"])
+    assert told.values["force"] == pytest.approx(1.0, abs=4.0 * told.std["force"])
 
 
 def test_a_joint_of_hardly_any_yield_displacement_is_a_loss_of_stiffness():
@@ -104,7 +104,7 @@ def test_a_joint_of_hardly_any_yield_displacement_is_a_loss_of_stiffness():
     assert found.effects[0].stands_out(nominal) and not found.effects[0].is_sure(nominal)
     (told,) = _significant(search, found, (), 0.0).effects
     assert told.kind is loss.kind
-    assert told.values["stiffness"] == pytest.approx(-15.0, abs=4.0 * told.deviations["stiffness"])
+    assert told.values["stiffness"] == pytest.approx(-15.0, abs=4.0 * told.std["stiffness"])
 
 
 @pytest.mark.parametrize(("speed", "stated"), [(1e-5, False), (0.05, True)])

@@ -64,7 +64,7 @@ def test_a_law_is_named_beside_them_and_its_interval_holds(rig, measured):
     verdict = diagnose(rig, fitted, validation=[kept])
     (effect,) = (e for e in verdict.effects if not e.kind.applied_first)
     assert effect.kind.name == "cubic_spring" and effect.at == pytest.approx(AT, abs=0.03 * rig.modes.length)
-    assert abs(effect.values["stiffness"] - STIFFNESS) < 2.5 * effect.deviations["stiffness"]
+    assert abs(effect.values["stiffness"] - STIFFNESS) < 2.5 * effect.std["stiffness"]
 
 
 def beside_modes_of(rig, records, catalogue=CATALOGUE) -> Stepwise:

@@ -107,9 +107,9 @@ def test_it_is_found_beside_small_errors_of_the_model(rig, records):
     found = random_with_nominal_errors(search, step, surely=False)
     wind = found.best.effects[-1]
     assert wind.label == "random_disturbance"
-    assert wind.values["at"] == pytest.approx(1.3, abs=3.0 * wind.deviations["at"])
-    assert wind.values["rms"] == pytest.approx(0.05, abs=3.0 * wind.deviations["rms"])
-    assert wind.deviations["rms"] < 0.005
+    assert wind.values["at"] == pytest.approx(1.3, abs=3.0 * wind.std["at"])
+    assert wind.values["rms"] == pytest.approx(0.05, abs=3.0 * wind.std["rms"])
+    assert wind.std["rms"] < 0.005
 
 
 @pytest.mark.slow

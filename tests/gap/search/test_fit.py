@@ -53,7 +53,7 @@ def test_a_fit_follows_the_valley_along_which_a_place_makes_up_for_a_strength(ri
     nominal = cost_of(rig, (), data)
     # where the beam moves half as much a spring must be sixteen times as hard
     found = fit(rig, (Effect(CUBIC, None, {"at": 0.1, "stiffness": 16 * 400.0}),), data, iterations=20)
-    values, spread = found.effects[0].values, found.effects[0].deviations
+    values, spread = found.effects[0].values, found.effects[0].std
     assert nominal > 100 and found.cost < 1.02
     assert values["at"] == pytest.approx(0.2, abs=4 * spread["at"] + 1e-3)
     assert values["stiffness"] == pytest.approx(400.0, rel=0.05)
@@ -87,7 +87,7 @@ def test_a_number_comes_back_from_its_bound(rig, measured):
     data = measured(LOSS.apply(rig, None, {"at": 1.2, "width": 0.33, "loss": 0.05}))
     # a fit from the narrow side overshoots to the widest loss there may be
     found = fit(rig, (Effect(LOSS, None, {"at": 1.3, "width": 0.4, "loss": 0.03}),), data, iterations=20)
-    values, spread = found.effects[0].values, found.effects[0].deviations
+    values, spread = found.effects[0].values, found.effects[0].std
     assert found.cost < 1.02
     assert values["at"] == pytest.approx(1.2, abs=4 * spread["at"] + 1e-4)
     assert values["width"] == pytest.approx(0.33, abs=4 * spread["width"])

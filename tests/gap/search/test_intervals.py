@@ -47,7 +47,7 @@ def test_a_deviation_is_that_of_fits_that_leave_out_a_block_each(hinged_rig):
     expected = np.sqrt(((without - slope) ** 2).sum())
     assert found.values["gain"] == pytest.approx(slope, rel=1e-6)
     assert expected > 1.5 * noise[0] / np.sqrt(s @ s)  # white noise of that size would say less
-    assert found.deviations["gain"] == pytest.approx(expected, rel=0.01)
+    assert found.std["gain"] == pytest.approx(expected, rel=0.01)
 
 
 @pytest.mark.parametrize("learnt", [0.01, 2e-5])
@@ -72,7 +72,7 @@ def test_a_gain_is_known_no_better_than_calibrations_and_is_relative_to_that_of_
     found = fit(rig, (start, nominal_errors(rig, NominalPrior(gain=learnt))), data)
     told = with_intervals(rig, found, data).effects[0]
     assert told.values["gain"] == pytest.approx(1.8, rel=1e-3)
-    assert told.deviations["gain"] == pytest.approx(1.8 * 0.01 * np.sqrt(2.0), rel=0.05)  # of both ports
+    assert told.std["gain"] == pytest.approx(1.8 * 0.01 * np.sqrt(2.0), rel=0.05)  # of both ports
 
 
 def test_a_law_is_known_no_better_than_the_scale_of_the_shapes_at_all_ports(hinged_rig):
@@ -89,7 +89,7 @@ def test_a_law_is_known_no_better_than_the_scale_of_the_shapes_at_all_ports(hing
     found = fit(rig, (law, nominal_errors(rig, NominalPrior(shape=size))), data)
     told = with_intervals(rig, found, data).effects[0]
     ports, modes = len(rig.actuators) + len(rig.sensors), rig.modes.n_modes
-    assert told.deviations["stiffness"] == pytest.approx(2.0 * stiffness * size / np.sqrt(ports * modes), rel=0.05)
+    assert told.std["stiffness"] == pytest.approx(2.0 * stiffness * size / np.sqrt(ports * modes), rel=0.05)
 
 
 @pytest.mark.slow
@@ -113,9 +113,9 @@ def test_noise_of_the_inputs_widens_the_interval_of_a_law_as_fits_to_other_draws
     values = [fitted(seed)[0].effects[0].values["stiffness"] for seed in range(30)]
     found, data = fitted(0)
     told, without = (with_intervals(nominal, found, data, logged=logged) for logged in (share, 0.0))
-    deviation = told.effects[0].deviations["stiffness"]
+    deviation = told.effects[0].std["stiffness"]
     assert deviation == pytest.approx(np.std(values), rel=0.5)
-    assert deviation > 1.5 * without.effects[0].deviations["stiffness"]
+    assert deviation > 1.5 * without.effects[0].std["stiffness"]
     free = np.diag(told.covariance) / np.diag(without.covariance)
     assert (free > 1.0 - 1e-9).all() and free.max() > 1.5**2
 
@@ -137,10 +137,10 @@ def test_a_place_where_the_structure_moves_most_is_known_by_the_square_of_the_di
     def objection(values):
         return np.sum(data.residual(apply_all(nominal, (replace(mass, values=values),))) ** 2)
 
-    inwards = found.values["at"] - found.deviations["at"]
+    inwards = found.values["at"] - found.std["at"]
     best = minimize_scalar(lambda m: objection({"at": inwards, "mass": m}), bracket=(0.019, 0.021))
     assert found.values["at"] == pytest.approx(1.0, abs=1e-4)
-    assert 0.01 < found.deviations["at"] < 0.2
+    assert 0.01 < found.std["at"] < 0.2
     assert best.fun == pytest.approx(1.0, rel=0.5)
 
 
@@ -165,6 +165,6 @@ def test_a_spring_is_known_no_better_than_the_mode_shapes_where_it_stands():
     search = Search(rig(nominal), data, data, data, CATALOGUE, lambda text, share: None, ALONE, np.ones((1, 2)))
     found = fit_jointly(search, (spring,), nominal_errors(search.rig, search.prior), until_convergence=True).fit
     wide, narrow = (with_intervals(search.rig, f, data).effects[0] for f in (with_all_errors(search, found), found))
-    more = np.sqrt(wide.deviations["stiffness"] ** 2 - narrow.deviations["stiffness"] ** 2)
+    more = np.sqrt(wide.std["stiffness"] ** 2 - narrow.std["stiffness"] ** 2)
     assert 0.01 * np.sqrt(2.0) < more / 40.0 < 0.05
-    assert abs(wide.values["stiffness"] - 40.0) < 2.0 * wide.deviations["stiffness"]
+    assert abs(wide.values["stiffness"] - 40.0) < 2.0 * wide.std["stiffness"]

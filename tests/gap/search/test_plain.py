@@ -90,7 +90,7 @@ def test_a_gain_beside_common_errors_is_known_no_better_than_calibrations(search
     np.testing.assert_allclose(*(one.data.residual(apply_all(one.rig, f.effects)) for f in (found, wide)), atol=1e-6)
     told = with_intervals(one.rig, wide, one.data).effects[0]
     of_gains = 0.01 * np.sqrt(2.0 / 5.0) * np.sqrt(1.0 + 1.0 / 4.0)  # and the mass is not known exactly either
-    assert of_gains < told.deviations["gain"] / 0.8 < 2.0 * of_gains
+    assert of_gains < told.std["gain"] / 0.8 < 2.0 * of_gains
 
 
 def test_what_is_common_to_all_modes_of_a_plate_is_an_error_of_each(search):
@@ -236,7 +236,7 @@ def test_a_sensor_on_the_late_side_of_jumps_stays_there_by_a_trifle(hinged_rig):
 @pytest.mark.parametrize(("deviation", "is_late"), [(0.02, True), (0.2, False)])
 def test_a_sensor_is_late_where_it_is_surely_so(hinged_rig, deviation, is_late):
     errors = nominal_errors(hinged_rig(n_modes=4), NominalPrior(delay=0.3, sample_time=0.01), {"delay_d2": 0.5})
-    errors = replace(errors, deviations={"delay_d2": deviation})
+    errors = replace(errors, std={"delay_d2": deviation})
     assert bool(delay_effects(hinged_rig(n_modes=4), errors)) is is_late
 
 
@@ -254,7 +254,7 @@ def test_sensors_that_are_all_late_alike_are_so_for_one_cause(hinged_rig, delays
     names = [f"delay_d{i + 1}" for i in range(4)]
     prior = NominalPrior(delay=0.3, sample_time=0.01)
     errors = nominal_errors(hinged_rig(n_modes=4), prior, dict(zip(names, delays, strict=True)))
-    errors = replace(errors, deviations=dict.fromkeys(names, deviation))
+    errors = replace(errors, std=dict.fromkeys(names, deviation))
     found = delay_effects(hinged_rig(n_modes=4), errors)
     causes = [("sensor_lag", "all"), ("actuator_lag", "F"), ("actuator_delay", "F")] if has_one_cause else []
     assert [(effect.kind.name, effect.target) for effect in found] == causes
@@ -307,5 +307,5 @@ def test_an_effect_that_smooth_errors_could_mimic_stays_significant(search):
     one = search((spring,))
     found = uniform_as_nominal_errors(one, fit(one.rig, (spring, *NO_UNIFORM_ERROR), one.data))
     (told,) = (e for e in with_intervals(one.rig, with_all_errors(one, found), one.data).effects if e.at is not None)
-    assert told.deviations["stiffness"] < 0.05  # 0.16 with errors that could do all of it
-    assert told.values["stiffness"] == pytest.approx(0.1, abs=3.0 * told.deviations["stiffness"])
+    assert told.std["stiffness"] < 0.05  # 0.16 with errors that could do all of it
+    assert told.values["stiffness"] == pytest.approx(0.1, abs=3.0 * told.std["stiffness"])

@@ -105,7 +105,7 @@ def test_friction_beside_small_errors(rig, measured, records):
     (named,) = (e for e in verdict.effects if e.kind is not NOMINAL_ERRORS)
     assert verdict.outcome == "explained" and named.kind.name == "coulomb_friction"
     force, at = named.values["force"], named.values["at"]
-    assert abs(force - truth.force) < 3.0 * named.deviations["force"] + 1e-3 * truth.force
+    assert abs(force - truth.force) < 3.0 * named.std["force"] + 1e-3 * truth.force
     assert abs(at - truth.at) < 0.01 and verdict.shrinkage.overall > 0.98
     assert sum(verdict.budget.effects.values()) + verdict.budget.nominal > 0.99
 
@@ -382,5 +382,5 @@ def test_a_mass_at_the_tip_is_not_taken_for_errors_of_the_model():
     (found,) = (effect for effect in verdict.effects if effect.kind is not NOMINAL_ERRORS)
     assert found.kind.name == "point_mass", verdict.sentence
     assert found.at == pytest.approx(1.2, abs=0.012)
-    assert found.values["mass"] == pytest.approx(mass, abs=2.5 * found.deviations["mass"])
-    assert found.deviations["mass"] < 0.2 * mass
+    assert found.values["mass"] == pytest.approx(mass, abs=2.5 * found.std["mass"])
+    assert found.std["mass"] < 0.2 * mass

@@ -320,13 +320,15 @@ class Effect:
         kind: of the catalogue.
         target: input, output, two of them, "all", an end, or None.
         values: by parameter name; at named points also "at", the name of the point or the two it acts between.
-        deviations: standard deviations by parameter name, where it was fitted.
+        std: standard error by parameter name, where it was fitted.
     """
 
     kind: Kind
     target: Any
     values: dict[str, Any]
-    deviations: dict[str, float] = field(default_factory=dict)
+    std: dict[str, float] = field(default_factory=dict)
+
+    deviations = Renamed("std")
 
     def apply(self, rig: Rig) -> Rig:
         """The rig with the effect."""
@@ -346,15 +348,15 @@ class Effect:
 
         True for an effect without neutral values, and for nominal errors.
         """
-        tested = [p for p in self.parameters(rig) if p.neutral is not None and self.deviations.get(p.name, 0.0) > 0]
-        off = any(abs(self.values[p.name] - p.neutral) > self.deviations[p.name] for p in tested)
+        tested = [p for p in self.parameters(rig) if p.neutral is not None and self.std.get(p.name, 0.0) > 0]
+        off = any(abs(self.values[p.name] - p.neutral) > self.std[p.name] for p in tested)
         return off or not tested or self.kind.applied_first
 
     def is_sure(self, rig: Rig) -> bool:
         """Whether every stated parameter but the place differs from neutral by more than its standard deviation."""
         nothing = {p.name: p.neutral or 0.0 for p in self.parameters(rig) if p.name not in COORDINATES}
         stated = [(name, value) for name, value in self.stated(rig).items() if name in nothing]
-        return all(not abs(value - nothing[name]) < self.deviations.get(name, 0.0) for name, value in stated)
+        return all(not abs(value - nothing[name]) < self.std.get(name, 0.0) for name, value in stated)
 
     def stated(self, rig: Rig) -> dict[str, Any]:
         """The parameters that a verdict states, by name."""
@@ -385,6 +387,9 @@ class Effect:
         """Name of the kind with its target."""
         names = ", ".join(self.target) if type(self.target) is tuple else self.target
         return f"{self.kind.name}[{names}]" if isinstance(names, str | int) else self.kind.name
+
+
+Effect.__init__ = former_arguments(deviations="std")(Effect.__init__)  # type: ignore[method-assign]
 
 
 def names_in(target: Any) -> tuple[str, ...]:

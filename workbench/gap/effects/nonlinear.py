@@ -208,7 +208,7 @@ def _has_negligible_speed(friction: Effect) -> bool:
 
     If it is too large for them instead, the force is as uncertain, since friction is then a damper.
     """
-    unsure = {name for name, deviation in friction.deviations.items() if deviation > friction.values[name]}
+    unsure = {name for name, deviation in friction.std.items() if deviation > friction.values[name]}
     return "smoothing_speed" in unsure and not any(name.startswith("force") for name in unsure)
 
 
@@ -221,11 +221,11 @@ def _stated_numbers(friction: Effect, _: Rig) -> dict[str, float]:
 def _with_negligible_speed(friction: Effect) -> Effect:
     """Friction with a much smaller smoothing speed, whose standard deviation is at least the former value."""
     speed = friction.values["smoothing_speed"]
-    unsure = max(friction.deviations.get("smoothing_speed", 0.0), speed)
+    unsure = max(friction.std.get("smoothing_speed", 0.0), speed)
     return replace(
         friction,
         values={**friction.values, "smoothing_speed": NEGLIGIBLE_SPEED * speed},
-        deviations={**friction.deviations, "smoothing_speed": unsure},
+        std={**friction.std, "smoothing_speed": unsure},
     )
 
 

@@ -385,7 +385,7 @@ def effect_json(effect: Effect, nominal: Rig, named_units: Units = SI) -> dict[s
     kind = effect.kind
     stated = effect.stated(nominal)
     entry: dict[str, Any] = {"kind": kind.name, "parameters": all_rounded(stated)}
-    deviations = {n: rounded(d) for n, d in effect.deviations.items() if n in stated}
+    deviations = {n: rounded(d) for n, d in effect.std.items() if n in stated}
     if deviations:
         entry["parameters_std"] = deviations
     units = {p.name: named_units.named(p.unit) for p in effect.parameters(nominal) if p.unit and p.name in stated}
@@ -398,7 +398,7 @@ def effect_json(effect: Effect, nominal: Rig, named_units: Units = SI) -> dict[s
         entry["at"], entry["at_std"] = kind.fixed_place(effect, nominal)[0], 0.0
     elif effect.at is not None:
         entry |= _place_json(effect.at)
-        spread = [rounded(effect.deviations.get(name, 0.0)) for name in COORDINATES if name in effect.values]
+        spread = [rounded(effect.std.get(name, 0.0)) for name in COORDINATES if name in effect.values]
         entry["at_std"] = spread if len(spread) > 1 else spread[0]
         alike = proportional_points(effect.at, nominal.modes)
         if alike:
@@ -459,7 +459,7 @@ def _described(effect: Effect, nominal: Rig, named_units: Units = SI) -> str:
     stated = effect.stated(nominal)
     units = {p.name: named_units.named(p.unit) for p in effect.parameters(nominal) if p.name in stated}
     numbers = [
-        " ".join((name.replace("_", " "), _with_deviation(stated[name], effect.deviations.get(name, 0.0)), unit))
+        " ".join((name.replace("_", " "), _with_deviation(stated[name], effect.std.get(name, 0.0)), unit))
         for name, unit in units.items()
         if name not in COORDINATES
     ]
@@ -473,7 +473,7 @@ def _described(effect: Effect, nominal: Rig, named_units: Units = SI) -> str:
     if kind.fixed_place is not None:
         text += f" {kind.fixed_place(effect, nominal)[1]}"
     elif effect.at is not None:
-        text += f" {place_in_words(effect.at, effect.deviations)}"
+        text += f" {place_in_words(effect.at, effect.std)}"
         alike = proportional_points(effect.at, nominal.modes)
         if alike:
             more = f" and {len(alike) - 3} others" if len(alike) > 3 else ""

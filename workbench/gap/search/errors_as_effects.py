@@ -68,7 +68,7 @@ def may_be_small_error(effect: Effect, errors: Effect, search: Search) -> bool:
         search: of both.
     """
     numbers = {p.name: p.neutral for p in effect.parameters(search.rig) if p.neutral is not None}
-    reach = {name: ERRORS.wide * effect.deviations.get(name, 0.0) for name in numbers}
+    reach = {name: ERRORS.wide * effect.std.get(name, 0.0) for name in numbers}
     nearer = {
         name: float(np.clip(neutral, effect.values[name] - reach[name], effect.values[name] + reach[name]))
         for name, neutral in numbers.items()
@@ -154,7 +154,7 @@ def delay_effects(rig: Rig, errors: Effect) -> tuple[Effect, ...]:
     cause is a lag of the sensors or of the actuators, or a delay of the actuators.
     """
     delays = {name.removeprefix("delay_"): float(delay) for name, delay in in_group(errors.values, "delay").items()}
-    uncertainty = {name: ERRORS.sure * errors.deviations.get(f"delay_{name}", 0.0) for name in delays}
+    uncertainty = {name: ERRORS.sure * errors.std.get(f"delay_{name}", 0.0) for name in delays}
     late = [name for name, delay in delays.items() if abs(delay) > max(ERRORS.smallest_delay, uncertainty[name])]
     sample_time = errors.target.sample_time
     if len(delays) >= ERRORS.several and len(late) == 1 and delays[late[0]] > 0:

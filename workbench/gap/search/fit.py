@@ -520,7 +520,7 @@ def _result(problem: _Problem, free: np.ndarray, residual: np.ndarray, normal: n
     effects = problem.at(free)
     each = deviations_by_effect(effects, problem.parameters, deviations)
     return Fit(
-        effects=tuple(replace(e, deviations=d) for e, d in zip(effects, each, strict=True)),
+        effects=tuple(replace(e, std=d) for e, d in zip(effects, each, strict=True)),
         normal=normal,
         cost=cost,
         cost_by_channel=problem.data.by_channel(residual),

@@ -100,7 +100,7 @@ class _Linearised:
         variances = np.max([np.diag(spread), level * np.diag(inverse), np.diag(of_inputs)], axis=0).clip(0.0)
         free = np.sqrt(variances / scale**2 + model_scatter**2)
         deviations = deviations_by_effect(found.effects, self.parameters, free)
-        effects = (replace(e, deviations={**e.deviations, **d}) for e, d in zip(found.effects, deviations, strict=True))
+        effects = (replace(e, std={**e.std, **d}) for e, d in zip(found.effects, deviations, strict=True))
         joint = _no_smaller_sandwich(root, information @ spread @ information, level, len(without))
         joint = _no_smaller(joint, of_inputs) / np.outer(scale, scale) + np.diag(model_scatter**2)
         return replace(found, effects=tuple(effects), covariance=joint)

@@ -347,7 +347,7 @@ def _scaled_errors(errors: Effect, group: str) -> Floats:
     """Nominal errors of a group and their posterior standard deviations, each over its weight: (2, n_errors)."""
     names = list(in_group(errors.values, group))
     weights = [weight_of(name, errors.target) for name in names]
-    each = [[found.get(name, 0.0) for name in names] for found in (errors.values, errors.deviations)]
+    each = [[found.get(name, 0.0) for name in names] for found in (errors.values, errors.std)]
     scaled: Floats = np.array(each).reshape(2, len(names)) / np.array(weights)
     return scaled
 
@@ -362,9 +362,9 @@ def _without_negligible_groups(found: Fit) -> Fit:
     ]
     none = [group for group in none if group != "delay" or not errors.target.late]
     kept = {name: value for name, value in errors.values.items() if group_of(name) not in none}
-    deviations = {name: errors.deviations[name] for name in kept if name in errors.deviations}
+    deviations = {name: errors.std[name] for name in kept if name in errors.std}
     target = replace(errors.target, **dict.fromkeys(none, 0.0))
-    return replace(found, effects=(*effects, replace(errors, target=target, values=kept, deviations=deviations)))
+    return replace(found, effects=(*effects, replace(errors, target=target, values=kept, std=deviations)))
 
 
 def with_all_groups(search: Search, errors: Effect) -> Effect:

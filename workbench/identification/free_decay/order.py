@@ -8,7 +8,7 @@ grid of λ:
 which has a chi-square distribution of two degrees of freedom per output where the residual is white noise of standard
 deviation s_j. The strongest candidate enters the model, and a likelihood ratio test (`signal/searches`) decides whether
 it stays. Rejected candidates are reported as noise. The search ends when the strongest candidate of the grid is no
-stronger than the strongest of so many in noise.
+stronger than the strongest of so many in noise, or after some that were rejected or only split a mode.
 """
 
 from collections.abc import Iterator, Sequence
@@ -192,7 +192,13 @@ def _identify_stepwise(
     def selected(some: Sequence[Record]) -> tuple[_FreeDecay, _Model]:
         problem = _FreeDecay(some, false_alarm, records, search_time, verdicts)
         selection = OrderSelection(
-            problem, max_modes, ORDER.most_weak, ORDER.most_splits, False, search_time, alone=True
+            problem,
+            max_modes,
+            ORDER.most_weak,
+            ORDER.most_splits,
+            forgets=False,
+            time_limit=search_time,
+            alone=True,
         )
         model = selection.select(problem.nothing)
         problem.rejected = selection.rejected

@@ -285,7 +285,7 @@ def refine(
 
     Args:
         records: free decay in white noise, of the same sensors at one rate.
-        start: from `stacked_delays`; its shapes are not used.
+        start: near the modes, such as of `stacked_delays`; its shapes are not used.
         offset: whether each output may also hold a constant.
         time_limit: of processor time; none unless given.
 
