@@ -237,7 +237,7 @@ def _validated(rig: Rig, found: Attribution, held_out: Sequence[Record], settle:
         dropped = [e for e in effects if e not in kept]
         return _validated(rig, found.without(*dropped), held_out, settle) if dropped else found
     named = [e for e in effects if not e.kind.applied_first and not e.is_in_readings]
-    if found.outcome != "explained" or len(named) < 2 or _unpredictable(found):
+    if found.outcome != "explained" or len(named) < 2 or not held_out or _unpredictable(found):
         return found
     after = _residual_power(rig, effects, held_out, settle)
     trifle = max(WORTH * after, TRIFLE * _residual_power(rig, (), held_out, settle))
