@@ -133,7 +133,7 @@ def _with_one_more(search: Search, best: WithRandom, evidence: Evidence) -> list
     search.progress("effects with a random disturbance", 0.2)
     whitener = model_filter(evidence.model, evidence.rig, best.random)
     whitened = search.through(whitener, _observer(search, evidence.rig, best.random))
-    gaining = whitened.side_by_side(simplest, _improving(search, whitened, best.given, evidence)[: RANDOM.tried])
+    gaining = whitened.in_parallel(simplest, _improving(search, whitened, best.given, evidence)[: RANDOM.tried])
     if any(search.explains(finished(search, candidate)) for candidate in gaining):
         return None
     found = [_fitted_with_random(search, candidate) for candidate in gaining]

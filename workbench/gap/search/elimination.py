@@ -90,7 +90,7 @@ def limiting_case(search: Search, step: JointFit, gap: float) -> JointFit:
     if step.explains:
         return step
     limits = fitted_to_quick(search, list(with_one_simpler(step.effects, search.rig)), step)
-    as_good = [s for s in search.side_by_side(fitted_to_all, limits) if is_as_good(s, step, gap)]
+    as_good = [s for s in search.in_parallel(fitted_to_all, limits) if is_as_good(s, step, gap)]
     return limiting_case(search, min(as_good, key=lambda s: s.fit.cost), gap) if as_good else step
 
 

@@ -103,7 +103,7 @@ class Pairs:
         explaining = [f for f in likeliest if self.search.explains(f)]
         if explaining:
             plain = plainest(self.search, explaining)
-            best, alternatives = ranked(self.search, self.search.side_by_side(simplest, plain))
+            best, alternatives = ranked(self.search, self.search.in_parallel(simplest, plain))
             return Decision("explained", best, alternatives=alternatives)
         best, alternatives = ranked(self.search, likeliest)
         return unexplained(start, best, alternatives)
@@ -131,7 +131,7 @@ class Pairs:
             return False
         likeliest = best_of_each(self.found)[: PAIRS.tried_further]
         fresh = [f for f in likeliest if search.near(f, PAIRS.very_near) and not _was_finished(f, self.relocated_pairs)]
-        elsewhere = search.side_by_side(relocated, fresh)
+        elsewhere = search.in_parallel(relocated, fresh)
         self.relocated_pairs = [*self.relocated_pairs, *fresh, *elsewhere]
         self._add(elsewhere)
         if any(search.explains(pair) for pair in elsewhere):
@@ -179,8 +179,8 @@ def _was_finished(pair: Fit, ended: Sequence[Fit]) -> bool:
 
 def _finished(search: Search, pairs: Sequence[Fit]) -> list[Fit]:
     """The pairs refined, and near misses in simpler forms too if none explains the records."""
-    ended = search.side_by_side(finished, pairs)
+    ended = search.in_parallel(finished, pairs)
     if any(search.explains(pair) for pair in ended):
         return ended
     near = [pair for pair in ended if search.near(pair, PAIRS.very_near)]
-    return [*search.side_by_side(simplified, near), *(pair for pair in ended if pair not in near)]
+    return [*search.in_parallel(simplified, near), *(pair for pair in ended if pair not in near)]

@@ -351,7 +351,7 @@ def _decide_on_singles(search: Search, start: Fit, singles: list[Fit]) -> tuple[
     explaining = [f for f in ended if search.explains(f)]
     if not explaining:
         near = [f for f in ended[:2] if search.near(f, RANDOM.near)]
-        moved = search.side_by_side(relocated, near)
+        moved = search.in_parallel(relocated, near)
         explaining = [f for f in moved if search.explains(f)]
         singles = sorted((*moved, *singles), key=lambda f: f.cost)
     if explaining:
@@ -370,7 +370,7 @@ def _finished_best(search: Search, fits: Sequence[Fit]) -> list[Fit]:
         promising = [
             f for f in promising if promise(f, SEARCH.further) < near or is_stepped(apply_all(search.rig, f.effects))
         ]
-    return [*search.side_by_side(finished, promising), *(f for f in fits if f not in promising)]
+    return [*search.in_parallel(finished, promising), *(f for f in fits if f not in promising)]
 
 
 def _force_of_other_law(search: Search, evidence: Evidence) -> Fit | None:

@@ -156,7 +156,7 @@ class Stepwise:
         """Single effects, each fitted jointly with nominal errors that start from zero, best first."""
         sets = [f.effects for f in self._likeliest_singles()] if self.singles is None else self.singles
         keys = {key_of(step.effects) for step in self.known}
-        fresh = self.search.side_by_side(fit_from_zero, [effects for effects in sets if key_of(effects) not in keys])
+        fresh = self.search.in_parallel(fit_from_zero, [effects for effects in sets if key_of(effects) not in keys])
         found = [s for s in (*self.known, *fresh) if not may_be_port_errors(self.search, s.effects)]
         # one step ahead without nominal errors, the true law may come after errors of gain and place
         nearest = min(found, key=lambda s: s.fit.cost, default=None)
@@ -367,7 +367,7 @@ class Stepwise:
         if length_limit < 0.0:
             return
         sets = [f.effects for f in self._linear_singles[: STEPWISE.finalists]]
-        fitted = self.search.side_by_side(fit_from_zero, sets)
+        fitted = self.search.in_parallel(fit_from_zero, sets)
         tried = [s for s in fitted if s.is_plausible and not may_be_port_errors(self.search, s.effects)]
         shorter = [s for s in tried if s.description(noise) < length_limit]
         if not shorter:
@@ -484,7 +484,7 @@ class Stepwise:
         here, *others = fitted_to_quick(self.search, [(effect,), *places], step)
         elsewhere = [s for s in others if apart(s.effects[0], here.effects[0], domain)]
         near = _finalists(sorted(elsewhere, key=lambda s: s.fit.cost), STEPWISE.near * here.fit.cost)
-        whole = self.search.side_by_side(fitted_to_all, near)
+        whole = self.search.in_parallel(fitted_to_all, near)
         best = min(whole, key=partial(loss, self.search), default=step)
         return best if loss(self.search, best) < loss(self.search, step) else None
 
@@ -499,7 +499,7 @@ class Stepwise:
         self.search.progress("effects that errors of the model have absorbed", 0.6)
         named = {effect.kind for effect in step.effects}
         singles = [f.effects for f in self._linear_singles if f.effects[0].kind not in named][: STEPWISE.finalists]
-        tried = self.search.side_by_side(fit_from_zero, [(*step.effects, *each) for each in singles])
+        tried = self.search.in_parallel(fit_from_zero, [(*step.effects, *each) for each in singles])
         noise = step.noise_power
         longest = step.description(noise) - STEPWISE.shorter
         found = [
@@ -571,7 +571,7 @@ class Stepwise:
     def _reselected(self, step: JointFit) -> JointFit:
         """The best of a step and its competitors (`others`), refitted in the current search."""
         others = [s for s in step.others if key_of(s.effects) != key_of(step.effects)]
-        refitted = self.search.side_by_side(fitted_to_all, others)
+        refitted = self.search.in_parallel(fitted_to_all, others)
         best, *rest = sorted((step, *refitted), key=partial(loss, self.search))
         return self._simplest(best, rest)
 
@@ -661,7 +661,7 @@ class Stepwise:
         """The step with one more effect that explains the records without input noise, or None."""
         tried = [s for s in self._candidates_with_one_more(step) if not may_be_port_errors(self.search, s.effects)]
         near = _finalists(sorted(tried, key=lambda s: s.fit.cost), PLAIN.near)
-        whole = self.search.side_by_side(fitted_to_all, near)
+        whole = self.search.in_parallel(fitted_to_all, near)
         found = [s for s in whole if s.explains and s.is_plausible and self._is_accepted(s, step)]
         if not found:
             return None
