@@ -272,7 +272,8 @@ def _power_of_difference(
     if not can_be(rig, others):
         return np.inf
     one, other = apply_all(rig, effects), apply_all(rig, others)
-    return sum(signal_power(record, predict(one, record) - predict(other, record), settle) for record in held_out)
+    with np.errstate(over="ignore", invalid="ignore"):  # without one of two effects in balance, a response may diverge
+        return sum(signal_power(record, predict(one, record) - predict(other, record), settle) for record in held_out)
 
 
 def _outcome(found: Attribution, shrinkage: Shrinkage | None, beyond: np.ndarray, disagreeing: Sequence[str]) -> str:
