@@ -5,6 +5,7 @@ import sys
 import tempfile
 import time
 import traceback
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -187,6 +188,8 @@ def _already_kept(jobs: Iterable[Job]) -> list[tuple[str, dict[str, Any]]]:
 def _parallel(
     function: bytes, jobs: Iterable[Job], workers: int, running: Path, *, wait: bool
 ) -> Iterator[tuple[str, dict[str, Any] | None]]:
+    # joblib replaces a process that holds 300 MB more than at first, and warns; ours hold bounded caches
+    warnings.filterwarnings("ignore", message="A worker stopped while some jobs", category=UserWarning)
     with parallel_config(backend="loky", inner_max_num_threads=1):
         pool = Parallel(n_jobs=workers, batch_size=1, return_as="generator_unordered")
         yield from pool(delayed(_keyed)(function, job, running, wait) for job in list(jobs))
