@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect
+from workbench.gap.effects.effect import Effect, each_left_out
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.search.finish import finished, plainest, ranked, relocated, simplest, simplified
 from workbench.gap.search.fit import Fit, cost_of
@@ -63,6 +63,31 @@ class Pairs:
             return False
         # given the third effect, one of the two may have to be replaced
         return self._explained_with_one_more(tuple(_by_contribution(search, best)[:-1]))
+
+    def with_a_third_ahead(self, single: float) -> bool:
+        """Whether the best pair one step ahead and a third effect explain the records.
+
+        Two of three strong effects may be far from the records as a whole. One step ahead each must remove half of what
+        the others leave. Then each is sought again beside the two others: a pair found without the third effect may
+        have a wrong law or place.
+
+        Args:
+            single: cost of the best single effect, one step ahead.
+        """
+        search = self.search
+        if self.explain or not self.ahead or search.is_over:
+            return False
+        pair = self.ahead[0]
+        most = min(PAIRS.most * (search.nominal_ahead - 1.0), PAIRS.nearer * (single - 1.0))
+        if pair.cost - 1.0 > most:
+            return False
+        search.progress("three effects at once", 0.45)
+        three = one_more(search, pair.effects, search.evidence_with(pair.effects))
+        if not three or three[0].cost - 1.0 > PAIRS.nearer * (pair.cost - 1.0):
+            return False
+        for two in list(each_left_out(three[0].effects)):
+            three = [*three, *one_more(search, two, search.evidence_with(two))]
+        return self._add_and_check(sorted(three, key=lambda f: f.cost))
 
     def _explained_with_one_more(self, given: tuple[Effect, ...]) -> bool:
         """Whether these effects with one more explain the records."""

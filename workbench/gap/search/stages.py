@@ -125,8 +125,19 @@ class Stages:
             both = fit(search.rig, (*effects, *missing), search.data, iterations=ATTRIBUTION.together)
             if search.surely_better(both, decision.best.cost, 1):
                 return None
-        sure = with_intervals(search.rig, decision.best, search.data, search.workers).effects
-        return decision if all(effect.stands_out(search.rig) for effect in sure) else None
+        return self._if_significant(decision)
+
+    def three_at_noise_floor(self) -> Decision | None:
+        """Three strong effects, with the stated sensor noise; none of them an error of the model, as in pairs."""
+        pairs, search = replace(self.screened_pairs), self.search
+        if not (self.ahead and pairs.with_a_third_ahead(self.ahead[0].cost)):
+            return None
+        decision = pairs.decision(self.start)
+        effects = decision.best.effects
+        uniform = {effect.kind for effect in NO_UNIFORM_ERROR}
+        if any(effect.kind in uniform or is_plausible_error(effect, search) for effect in effects):
+            return None
+        return self._if_significant(decision)
 
     def single_in_louder_noise(self) -> Decision | None:
         """One effect and noise louder than stated: fewer parameters than nominal errors that fit equally well."""
@@ -307,6 +318,12 @@ class Stages:
             or (stepwise.is_noise_only and stepwise.has_plausible_errors)
         )
 
+    def _if_significant(self, decision: Decision) -> Decision | None:
+        """The decision, if each of its effects has a significant parameter."""
+        search = self.search
+        sure = with_intervals(search.rig, decision.best, search.data, search.workers).effects
+        return decision if all(effect.stands_out(search.rig) for effect in sure) else None
+
     def _of_pairs(self) -> Decision | None:
         """The decision for the best pair, unless it is of uniform errors that small errors of the model include."""
         decision = self.pairs.decision(self.start)
@@ -324,6 +341,7 @@ STAGES: tuple[Stage, ...] = (
     Stages.single_effect,
     Stages.random_at_one_sensor,
     Stages.pair_at_noise_floor,
+    Stages.three_at_noise_floor,
     Stages.single_in_louder_noise,
     Stages.with_missing_modes,
     Stages.random_beside_effects,
