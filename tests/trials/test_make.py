@@ -306,4 +306,4 @@ def test_no_gain_of_a_sensor_looks_like_another_unit():
     kinds = ("one_sided_stop", "random_disturbance", "sensor_gain")
     _, truth = make_trial(20390403, kinds=kinds, imperfections="triple")  # was drawn as 130
     (gain,) = (effect["gain"] for effect in truth["effects"] if effect["kind"] == "sensor_gain")
-    assert 0.1 <= abs(gain) <= 10.0
+    assert 1.0 / 30.0 <= gain <= 30.0

@@ -243,8 +243,8 @@ def _reading(name: str, number: Callable[[Scene, np.ndarray, float], float], *, 
 
 
 def _gain(logarithm: float) -> float:
-    """A gain between 0.1 and 10: beyond, a channel in another unit is likelier, and a diagnosis asks for the unit."""
-    return float(np.exp(np.clip(logarithm, -np.log(10.0), np.log(10.0))))
+    """A gain between 1/30 and 30: beyond, a channel in another unit is likelier, and a diagnosis asks for the unit."""
+    return float(np.exp(np.clip(logarithm, -np.log(30.0), np.log(30.0))))
 
 
 def _quantisation(scene: Scene, rng: np.random.Generator) -> Numbers:

@@ -250,6 +250,8 @@ def test_noise_is_found_beside_resonances_and_in_colours(memory):
         (20381247, "gain", 1.0, ("bouc_wen",)),  # unknown: it does not show one step ahead
         # the spring told as a loss of stiffness and an error of all stiffness
         (20390282, "triple", 2.0, ("ground_spring", "periodic_disturbance", "point_mass")),
+        # as unknown, after twelve times the time: no two of the three are near the records as a whole
+        (20390381, "triple", 2.0, ("cubic_spring", "one_sided_stop", "sensor_gain")),
         (20390321, "input", 0.5, ("sensor_clipping",)),  # as unknown: noise of the inputs was left
         (20390351, "offset", 0.5, ("two_way_friction",)),  # as friction and a constant force of an actuator beside it
         (20390256, "late", 0.5, ("bouc_wen",)),  # at a wrong place, with louder noise for the rest

@@ -1,4 +1,4 @@
-"""Search for pairs of effects, both at once and one after the other, until one explains the records."""
+"""Search for pairs of effects, both at once and one after the other, or for three, until a set explains the records."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
