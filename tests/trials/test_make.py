@@ -18,7 +18,7 @@ from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import NamedPoints
 from workbench.structure.member import Bar
 from workbench.structure.modes import Modes, PointShapes
-from workbench.trials.hidden import stands
+from workbench.trials.hidden import place_of
 from workbench.trials.hold import COMMON_KINDS, RARE_KINDS, draw_kinds, hold_trials, write_trials
 from workbench.trials.make import KINDS, OUTSIDE_KINDS, make_trial
 from workbench.trials.scoring import score, tally
@@ -129,7 +129,7 @@ def test_trials_on_plain_modal_data_use_its_levels_and_places(kind):
 def test_friction_of_two_directions_shows_in_the_records_that_it_hides_in(structure, seed):
     case, label = make_trial(seed, kinds=("two_way_friction",), structure=structure)
     (told,) = label["effects"]
-    place, speed = place_values(stands(told)), told["smoothing_speed"]
+    place, speed = place_values(place_of(told)), told["smoothing_speed"]
     forces = told["force_forward"], told["force_backward"]
     kinds = BY_NAME["two_way_friction"], BY_NAME["coulomb_friction"]
     numbers = dict(zip(("force_forward", "force_backward"), forces, strict=True)), {"force": float(np.mean(forces))}

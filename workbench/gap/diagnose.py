@@ -158,7 +158,7 @@ def diagnose(
             evidence = evidence.of_rig(apply_all(evidence.rig, attribution.missing))
         if attribution.outcome == "explained" and attribution.random is None:
             # alternatives are fitted to the same whitened records as the best set
-            alike, search = ready().indistinguishable, replace(attribution.search, data=attribution.weighed)
+            alike, search = ready().indistinguishable, replace(attribution.search, data=attribution.whitened)
             alternatives = with_equals(search, attribution.best, attribution.alternatives, evidence, alike)
             attribution = replace(attribution, alternatives=alternatives)
         attribution = _validated(wired, attribution, validation, settle)
@@ -312,7 +312,7 @@ def _leaves_unexplained(budget: Budget, power: float, tolerance: float) -> bool:
 def _leaves_far_more_than_noise(found: Attribution, shrinkage: Shrinkage | None, beyond: np.ndarray) -> bool:
     """Whether effects with implausibly large nominal errors leave a residual far above the noise of held-out records.
 
-    Such errors over-fit whatever is missing, so the residual is not just louder noise.
+    Such errors over-fit whatever is missing, so the residual is not just more noise than stated.
     """
     errors = next((e for e in found.best.effects if e.kind is NOMINAL_ERRORS), None)
     if found.outcome != "explained" or shrinkage is None or are_small(sizes_of(errors)) or _unpredictable(found):

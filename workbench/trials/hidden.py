@@ -18,7 +18,7 @@ NONE, UNKNOWN = "none", "unknown"  # kinds of a label: no hidden effect, or one 
 Hide = Callable[[Plant, dict[str, Any]], Plant]
 
 
-def stands(effect: dict[str, Any]) -> Any:
+def place_of(effect: dict[str, Any]) -> Any:
     """The place of an effect of a label: `Between` two points, a place, or None."""
     if "between" in effect:
         return Between(*effect["between"])
@@ -31,7 +31,7 @@ def _altered(plant: Plant, **changes: Any) -> Plant:
 
 
 def _law(law: PointLaw, plant: Plant, e: dict[str, Any]) -> Plant:
-    return replace(plant, laws=(*plant.laws, (law.code, stands(e), tuple(e[name] for name in law.parameters))))
+    return replace(plant, laws=(*plant.laws, (law.code, place_of(e), tuple(e[name] for name in law.parameters))))
 
 
 def _with_ports(plant: Plant, side: str, name: str, **changes: Any) -> Plant:
@@ -61,7 +61,7 @@ def _support(plant: Plant, e: dict[str, Any]) -> Plant:
 def _moved(side: str, key: str, plant: Plant, e: dict[str, Any]) -> Plant:
     """The plant with one actuator or sensor moved; a patch keeps its size."""
     (stood,) = (port.at for port in getattr(plant, side) if port.name == e[key])
-    return _with_ports(plant, side, e[key], at=centred_at(stood, stands(e)))
+    return _with_ports(plant, side, e[key], at=centred_at(stood, place_of(e)))
 
 
 def _swapped(side: str, key: str, plant: Plant, e: dict[str, Any]) -> Plant:
@@ -117,11 +117,11 @@ def _spikes(y: dict[str, Floats], sample_time: float, e: dict[str, Any]) -> Floa
 
 HIDE: dict[str, Hide] = {
     "modulus_error": lambda p, e: _altered(p, stiffness_factor=p.altered.stiffness_factor * e["factor"]),
-    "point_mass": lambda p, e: _altered(p, masses=(*p.altered.masses, (stands(e), e["mass"]))),
+    "point_mass": lambda p, e: _altered(p, masses=(*p.altered.masses, (place_of(e), e["mass"]))),
     "local_stiffness_loss": lambda p, e: _altered(p, losses=(*p.altered.losses, (e["at"], e["width"], e["loss"]))),
     "support_rotation": _support,
     "axial_load": lambda p, e: _altered(p, tension=e["tension"]),
-    "ground_spring": lambda p, e: _altered(p, springs=(*p.altered.springs, (stands(e), e["stiffness"]))),
+    "ground_spring": lambda p, e: _altered(p, springs=(*p.altered.springs, (place_of(e), e["stiffness"]))),
     "truncated_modes": lambda p, e: replace(p, n_modes=e["needed"]),
     "modal_damping": lambda p, e: replace(p, damping_factor=p.damping_factor * e["factor"]),
     **{name: partial(_law, law) for name, law in POINT_LAWS.items() if not law.outside},
@@ -148,9 +148,9 @@ HIDE: dict[str, Hide] = {
     "sensor_clipping": _sensor(limit="limit"),
     "sensor_quantisation": _sensor(step="step"),
     "periodic_disturbance": lambda p, e: replace(
-        p, tones=(*p.tones, (stands(e), e["amplitude"], e["frequency"], e["phase"]))
+        p, tones=(*p.tones, (place_of(e), e["amplitude"], e["frequency"], e["phase"]))
     ),
-    "random_disturbance": lambda p, e: replace(p, noises=(*p.noises, (stands(e), e["rms"], e["corner"]))),
+    "random_disturbance": lambda p, e: replace(p, noises=(*p.noises, (place_of(e), e["rms"], e["corner"]))),
     "stiffness_drift": lambda p, e: replace(p, stiffness_rate=e["rate"]),
     "actuator_crosstalk": _actuator_crosstalk,
 }

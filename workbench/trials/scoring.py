@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from workbench.structure.domain import Domain, NamedPoints, as_domain
-from workbench.trials.hidden import NONE, UNKNOWN, stands
+from workbench.trials.hidden import NONE, UNKNOWN, place_of
 
 NEAR = 0.02  # largest error of a place that counts as right, over the length
 NEAR_IF_IMPERFECT = 0.03  # the same for trials with imperfections
@@ -72,7 +72,7 @@ def score(
     kinds = sorted(e["kind"] for e in named) in (sorted(e["kind"] for e in hidden), sorted(since))
     pairs = [(hidden[i], named[j]) for i, j in sorted(_pairs(hidden, named, domain))] if kinds else []
     channels = [_same_channel(h, t) for h, t in pairs if "input" in h or "output" in h]
-    errors = [_off(h, t, domain) for h, t in pairs if stands(h) is not None and stands(t) is not None]
+    errors = [_off(h, t, domain) for h, t in pairs if place_of(h) is not None and place_of(t) is not None]
     return {
         "hidden": _words(hidden),
         "diagnosed": _words(named),
@@ -112,7 +112,7 @@ def score_imperfect(
     named = [e for e in verdict["effects"] if e["kind"] != UNKNOWN]
     pairs = [(hidden[i], named[j]) for i, j in _pairs(hidden, named, domain)]
     pairs = [(h, t) for h, t in pairs if _same_channel(h, t)]
-    errors = [_off(h, t, domain) for h, t in pairs if stands(h) is not None and stands(t) is not None]
+    errors = [_off(h, t, domain) for h, t in pairs if place_of(h) is not None and place_of(t) is not None]
     covered = [inside for h, t in pairs for inside in _inside(h, t)]
     budget = verdict.get("budget", {}).get("unexplained")
     complete = len(pairs) == len(hidden) == len(named)
@@ -214,7 +214,7 @@ def _off(hidden: dict[str, Any], named: dict[str, Any], domain: Domain | float) 
     A mass acts in all directions of its node, so that any point of the node is right.
     """
     places = as_domain(domain)
-    one, other = stands(hidden), stands(named)
+    one, other = place_of(hidden), place_of(named)
     if one is None or other is None:
         return 0.0
     if isinstance(places, NamedPoints) and hidden["kind"] == "point_mass":

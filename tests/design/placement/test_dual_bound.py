@@ -20,7 +20,7 @@ def task(hinged_modes):
 
 def bound_of(task, table, cell, half, effort):
     values, vectors = np.linalg.eigh(task.force_gramian)
-    tables = (table.value, table.slope, table.bend, table.most_bend, table.most_rate)
+    tables = (table.value, table.slope, table.curvature, table.most_curvature, table.most_rate)
     root = np.ascontiguousarray((vectors / np.sqrt(values)).T)
     # of the types that a search hands on, so that nothing is compiled twice
     transforms, square = np.array(task.roots, order="C"), np.array(task.force_gramian)

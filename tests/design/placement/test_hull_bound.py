@@ -140,7 +140,7 @@ def test_shapes_stay_by_the_parabolas_and_the_cubics(member, patched):
     shapes = task.shapes(table.centre[nodes] + s[:, :, 0] * h[:, 0])
     beyond = np.abs(shapes - cubic).max(axis=0)
     assert (beyond <= remainder[nodes] + 1e-12).all()
-    bent = np.minimum(np.abs(table.bend[nodes]) + h * table.most_rate[nodes], table.most_bend[nodes])
+    bent = np.minimum(np.abs(table.curvature[nodes]) + h * table.most_rate[nodes], table.most_curvature[nodes])
     linear = table.value[nodes] + s * h * table.slope[nodes]
     assert (np.abs(shapes - linear).max(axis=0) <= 0.5 * h**2 * bent + 1e-12).all()
     if member == "beam hinged hinged" and not patched:

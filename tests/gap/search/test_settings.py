@@ -37,14 +37,14 @@ def test_every_constant_is_read(ablation):
 
 
 def test_a_constant_is_altered_for_a_case_and_no_longer(ablation):
-    def pays():
-        return Search.pays(SimpleNamespace(data=SimpleNamespace(n_values=8000)), 0.006, 0)
+    def is_justified():
+        return Search.is_justified(SimpleNamespace(data=SimpleNamespace(n_values=8000)), 0.006, 0)
 
-    assert pays()  # twice the log-likelihood: 48, of 30 that it takes
+    assert is_justified()  # twice the log-likelihood: 48, of 30 that it takes
     with pytest.raises(RuntimeError, match="of the case"), ablation.altered("SEARCH", "sure", 2.0):
-        assert not pays()
+        assert not is_justified()
         raise RuntimeError("of the case")
-    assert pays() and SEARCH == settings.SearchSettings()
+    assert is_justified() and SEARCH == settings.SearchSettings()
     with pytest.raises(FrozenInstanceError):
         SEARCH.sure = 60.0
 

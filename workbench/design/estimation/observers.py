@@ -20,7 +20,7 @@ from workbench.design.laws.pole_assignment import assign
 from workbench.rig.sensors import Sensor
 from workbench.structure.modes import Modes
 
-UNSEEN = 1e-9  # of a mode's largest displacement: a smaller reading does not observe the mode
+UNOBSERVABLE = 1e-9  # of a mode's largest displacement: a smaller reading does not observe the mode
 # pole over ω: as fast as the observed mode, and damped enough that the initial error decays within two periods
 USUAL = -0.3 + 1j
 
@@ -111,11 +111,11 @@ def observed_plant(modes: Modes, law: Law, sensors: Sequence[Sensor]) -> tuple[F
     n = len(index)
     for j, r in enumerate(index):
         strength = max(np.abs(c[:, j]).max(), np.abs(c[:, n + j]).max())
-        if strength <= UNSEEN * grid[j]:
+        if strength <= UNOBSERVABLE * grid[j]:
             raise DesignError(f"mode {r + 1} is unobservable: all sensors are at its nodes; move or add one")
     # rigid modes are observable through displacements alone, and need as many independent ones as there are modes
     rigid = np.flatnonzero(own.omega == 0)
-    rank = int(np.linalg.matrix_rank(c[:, rigid] / grid[rigid], tol=UNSEEN)) if rigid.size else 0
+    rank = int(np.linalg.matrix_rank(c[:, rigid] / grid[rigid], tol=UNOBSERVABLE)) if rigid.size else 0
     if rank < rigid.size:
         raise DesignError(
             f"{rigid.size} rigid-body {'modes need' if rigid.size > 1 else 'mode needs'} as many independent"

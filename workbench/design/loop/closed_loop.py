@@ -22,7 +22,7 @@ from workbench.structure.domain import Place
 from workbench.structure.modes import Modes, freeze, frozen
 from workbench.structure.printed import Printed, counted, place_text
 
-UNSEEN = 1e-9  # response of a modal filter to a mode, below which the mode is unobservable
+UNOBSERVABLE = 1e-9  # response of a modal filter to a mode, below which the mode is unobservable
 WELL_CONDITIONED = 1e6  # condition number of eigenvectors up to which the closed form is used
 RESONANT = 1e-6  # of the fastest pole: poles nearer to each other have no closed form by partial fractions
 EVEN = 1e-15  # of the last instant: instants count as uniform if they deviate by no more
@@ -234,7 +234,7 @@ def close_loop(modes: Modes, law: Law | Controller, filter_: ModalFilter | None 
         if output.shape[0] != law.n_controlled:
             raise ValueError(f"the filter gives {output.shape[0]} modes; the law controls {law.n_controlled}")
         strength = np.abs(output[np.arange(law.n_controlled), list(law.controlled)])
-        if strength.min() < UNSEEN:
+        if strength.min() < UNOBSERVABLE:
             raise ValueError(
                 f"mode {law.controlled[strength.argmin()] + 1} is unobservable: the filter's sensors at"
                 f" {'; '.join(map(place_text, filter_.places))} are all at its nodes; move or add a sensor"

@@ -30,8 +30,8 @@ def largest(poles: np.ndarray, amplitudes: np.ndarray, span: float) -> float:
     for _ in range(MOST_ROUNDS):
         terms = np.exp(np.outer(start + 0.5 * width, poles)) * amplitudes[signal]
         value, slope = np.abs(terms.sum(axis=1).real), np.abs((terms @ poles).real)
-        bend = (size[signal] * np.exp(np.outer(start, decay))) @ np.abs(poles) ** 2
-        upper = value + 0.5 * width * slope + 0.125 * width**2 * bend
+        curvature = (size[signal] * np.exp(np.outer(start, decay))) @ np.abs(poles) ** 2
+        upper = value + 0.5 * width * slope + 0.125 * width**2 * curvature
         best = max(best, float(value.max()))
         kept = upper > best * (1 + TOLERANCE)
         if not kept.any():

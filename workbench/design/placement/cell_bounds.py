@@ -42,9 +42,9 @@ class Intervals:
 
     Attributes:
         centre, half: (n_intervals,) m.
-        value, slope, bend: (n_intervals, n_modes) φ, φ' and φ'' at the centre.
-        most_bend, most_rate: (n_intervals, n_modes) largest |φ''| and |φ'''| on the interval; where φ'' jumps, as at a
-            step of a beam's stiffness, the second alone is far too large.
+        value, slope, curvature: (n_intervals, n_modes) φ, φ' and φ'' at the centre.
+        most_curvature, most_rate: (n_intervals, n_modes) largest |φ''| and |φ'''| on the interval; where φ'' jumps, as
+            at a step of a beam's stiffness, the second alone is far too large.
         most_fourth: (n_intervals, n_modes) largest |φ''''|, increased where a lower derivative jumps so that it bounds
             a cubic's error there too; None where the nodes are groups of candidates.
     """
@@ -53,8 +53,8 @@ class Intervals:
     half: np.ndarray
     value: np.ndarray
     slope: np.ndarray
-    bend: np.ndarray
-    most_bend: np.ndarray
+    curvature: np.ndarray
+    most_curvature: np.ndarray
     most_rate: np.ndarray
     most_fourth: np.ndarray | None = None
 
@@ -65,16 +65,16 @@ class Intervals:
         leaves = 2**LEVELS
         grid = np.linspace(first, last, 2 * leaves + 1)
         step = grid[1] - grid[0]
-        value, slope, bend = (task.shapes(grid, derivative) for derivative in (0, 1, 2))
-        third = np.diff(bend, axis=0) / step
+        value, slope, curvature = (task.shapes(grid, derivative) for derivative in (0, 1, 2))
+        third = np.diff(curvature, axis=0) / step
         fourth = np.diff(third, axis=0, prepend=third[:1], append=third[-1:]) / step
         fourth = np.maximum(np.abs(fourth[:-1]), np.abs(fourth[1:])) + 3.0 * np.abs(np.diff(fourth, axis=0))
         rate = np.abs(third)
         varied = np.abs(np.diff(rate, axis=0, prepend=rate[:1], append=rate[-1:]))
         rate = rate + np.maximum(varied[:-1], varied[1:])
-        steep = np.maximum(np.abs(bend[:-1]), np.abs(bend[1:])) + 0.5 * step * rate
+        steep = np.maximum(np.abs(curvature[:-1]), np.abs(curvature[1:])) + 0.5 * step * rate
         # jumps of the slope, as at a step of a bar's stiffness: its change less the integral of φ''
-        jump = np.abs(np.diff(slope, axis=0) - 0.5 * step * (bend[:-1] + bend[1:]))
+        jump = np.abs(np.diff(slope, axis=0) - 0.5 * step * (curvature[:-1] + curvature[1:]))
         h, levels = step, []
         for _ in range(LEVELS + 1):
             steep, rate, fourth = (np.maximum(part[::2], part[1::2]) for part in (steep, rate, fourth))
@@ -84,7 +84,7 @@ class Intervals:
         at = np.concatenate([(2 * np.arange(2**k) + 1) * 2 ** (LEVELS - k) for k in range(LEVELS + 1)])
         half = np.concatenate([np.full(2**k, 0.5 * (last - first) / 2**k) for k in range(LEVELS + 1)])
         most = (np.concatenate([level[i] for level in reversed(levels)]) for i in range(3))
-        return cls(*(frozen(part) for part in (grid[at], half, value[at], slope[at], bend[at], *most)))
+        return cls(*(frozen(part) for part in (grid[at], half, value[at], slope[at], curvature[at], *most)))
 
 
 class CellBounds:
@@ -124,7 +124,7 @@ class CellBounds:
         bounded = np.array([part[3] for part in kept])
         self._arguments = (
             table.half,
-            (table.value, table.slope, table.bend, table.most_bend, table.most_rate),
+            (table.value, table.slope, table.curvature, table.most_curvature, table.most_rate),
             np.array(task.roots, order="C"),  # a writeable copy: numba would compile again for a read-only array
             matrices,
             inverses,
@@ -167,7 +167,7 @@ def _bounds(
     work: Floats,
     axis: Integers,
 ) -> None:
-    value, slope, _, most_bend, _ = tables
+    value, slope, _, most_curvature, _ = tables
     n_cells, n = cells.shape
     h, score = np.empty(n), np.empty(n)
     for cell in range(n_cells):
@@ -177,7 +177,7 @@ def _bounds(
             h[j], of_column = halves[node[j]], 0.0
             for k in range(n):
                 frame += value[node[j], k] ** 2
-                of_column += (abs(slope[node[j], k]) + h[j] * most_bend[node[j], k]) ** 2
+                of_column += (abs(slope[node[j], k]) + h[j] * most_curvature[node[j], k]) ** 2
             change += h[j] * np.sqrt(of_column)
         least_frame = np.sqrt(frame) - change  # a lower bound of ‖B‖ in the cell
         nearest = -np.inf

@@ -175,7 +175,7 @@ class _Search:
     def _feasible(self, cells: Integers) -> Integers:
         """Cells in which all actuators find allowed places in order, at the least distance or more."""
         tree = self._tree
-        room, first = tree.stands[cells].all(axis=1), np.full(len(cells), -np.inf)
+        room, first = tree.allowed[cells].all(axis=1), np.full(len(cells), -np.inf)
         for node in cells.T:
             first = np.maximum(tree.low[node], first + tree.apart)
             room &= tree.high[node] >= first
@@ -274,7 +274,7 @@ class CellTree:
         table: the modal shapes on every node.
         low, high: (n_nodes,) first and last place of each: m, or the numbers of its first and last candidate.
         apart: least distance from the first place of an actuator's node to the last place of the next actuator's.
-        stands: (n_nodes,) whether a node contains an allowed place.
+        allowed: (n_nodes,) whether a node contains an allowed place.
         levels: below the root.
         places: the places of the actuators of a cell (n_actuators,) of nodes, in the middle of each; None where one of
             them is not allowed.
@@ -286,7 +286,7 @@ class CellTree:
     low: np.ndarray
     high: np.ndarray
     apart: float
-    stands: np.ndarray
+    allowed: np.ndarray
     levels: int
     places: Callable[[np.ndarray], np.ndarray | None]
     kept: Callable[[np.ndarray], np.ndarray] | None = None
@@ -295,13 +295,13 @@ class CellTree:
 def _of_interval(task: PlacementTask, limits: Limits) -> CellTree:
     table, stretches = Intervals.of(task), limits.intervals(task.n_controlled, task.modes.length, task.reach[0])
     low, high = table.centre - table.half, table.centre + table.half
-    stands = np.any([(high >= first) & (low <= last) for first, last in stretches], axis=0)
+    allowed = np.any([(high >= first) & (low <= last) for first, last in stretches], axis=0)
 
     def places(cell: np.ndarray) -> np.ndarray | None:
         x: np.ndarray = table.centre[cell]
         return x if free_places(task.modes.domain, x, stretches).all() else None
 
-    return CellTree(table, low, high, limits.spacing, stands, LEVELS, places)
+    return CellTree(table, low, high, limits.spacing, allowed, LEVELS, places)
 
 
 def _of_candidates(task: PlacementTask, limits: Limits) -> CellTree:
@@ -334,8 +334,8 @@ def _of_candidates(task: PlacementTask, limits: Limits) -> CellTree:
     zero = frozen(np.zeros((n_nodes, n_modes)))
     # φ'' is chosen so that ½ h² |φ''| with h = 1 is the largest difference of a node's shapes from their middle
     half_width = np.where(sizes > 1, 1.0, 0.0)
-    bend = frozen(2.0 * radius)
-    table = Intervals(frozen(first), frozen(half_width), frozen(middle), zero, zero, bend, bend)
+    curvature = frozen(2.0 * radius)
+    table = Intervals(frozen(first), frozen(half_width), frozen(middle), zero, zero, curvature, curvature)
     at = coordinates(task.modes.domain, grid)
 
     def places(cell: np.ndarray) -> np.ndarray | None:

@@ -25,7 +25,7 @@ STEPS = 4  # of the Frank-Wolfe method
 BARELY = 1e-6  # of L²: least value of L² - T, so that t stays finite
 ROUND_OFF = 1e-8  # of g: a smaller residual g - c D⁻¹ cᵀ g is round-off, as in a cell of one place
 
-# value, slope, bend, most bend and most rate, (n_nodes, n_modes)
+# value, slope, curvature, most curvature and most rate, (n_nodes, n_modes)
 Tables = tuple[Floats, Floats, Floats, Floats, Floats]
 
 
@@ -38,15 +38,15 @@ def expanded(weights: Floats, node: int, h: float, tables: Tables) -> tuple[floa
         node, h: the interval and its half-width.
         tables: of the shapes on all intervals.
     """
-    value, slope, bend, most_bend, most_rate = tables
-    at, steep, bent, rate, most = 0.0, 0.0, 0.0, 0.0, 0.0
+    value, slope, curvature, most_curvature, most_rate = tables
+    at, steep, curved, rate, most = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(weights.size):
         at += weights[i] * value[node, i]
         steep += weights[i] * slope[node, i]
-        bent += weights[i] * bend[node, i]
+        curved += weights[i] * curvature[node, i]
         rate += abs(weights[i]) * most_rate[node, i]
-        most += abs(weights[i]) * most_bend[node, i]
-    return at, steep, 0.5 * h**2 * min(abs(bent) + h * rate, most)
+        most += abs(weights[i]) * most_curvature[node, i]
+    return at, steep, 0.5 * h**2 * min(abs(curved) + h * rate, most)
 
 
 @njit(cache=True, nogil=True)

@@ -79,21 +79,21 @@ class FeedbackTask:
         """Places (n,), and of the participation of a pair there: the largest second derivative (n_modes,), and the
         cumulative sum of the jumps of its slope (n, n_modes)."""
         grid = np.linspace(*self.reach, GRID)
-        slope, bend = (participation_along(self.modes, self.actuator, grid, order) for order in (1, 2))
-        varied, half_step = np.abs(np.diff(bend, axis=0)), 0.5 * (grid[1] - grid[0])
-        jumps = np.abs(np.diff(slope, axis=0) - half_step * (bend[:-1] + bend[1:])) + half_step * varied
+        slope, curvature = (participation_along(self.modes, self.actuator, grid, order) for order in (1, 2))
+        varied, half_step = np.abs(np.diff(curvature, axis=0)), 0.5 * (grid[1] - grid[0])
+        jumps = np.abs(np.diff(slope, axis=0) - half_step * (curvature[:-1] + curvature[1:])) + half_step * varied
         total_jumps = np.concatenate([np.zeros((1, self.modes.n_modes)), np.cumsum(jumps, axis=0)])
-        return grid, np.abs(bend).max(axis=0) + varied.max(axis=0), total_jumps
+        return grid, np.abs(curvature).max(axis=0) + varied.max(axis=0), total_jumps
 
     def tangent_error(self, centres: Floats, halves: Floats) -> Floats:
         """Largest difference (..., n_modes) of the participation from its tangent at `centres` (...,), m.
 
         It bounds the difference within `halves` (...,) m, with the jumps of a patch's slope at steps of the stiffness.
         """
-        grid, bend, total_jumps = self._derivatives
+        grid, curvature, total_jumps = self._derivatives
         first, last = grid.searchsorted(centres - halves, "right"), grid.searchsorted(centres + halves)
         jumps = total_jumps[np.minimum(last, grid.size - 1)] - total_jumps[np.maximum(first - 1, 0)]
-        return halves[..., None] * (0.5 * halves[..., None] * bend + jumps)
+        return halves[..., None] * (0.5 * halves[..., None] * curvature + jumps)
 
     def index(self, positions: ArrayLike) -> np.ndarray:
         """E (...) of pairs at the places (..., n_pairs), m; inf where the loop is unstable."""

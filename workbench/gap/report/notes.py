@@ -134,7 +134,7 @@ def steady_remainder(rig: Rig, records: Sequence[Record], *, settle: float = 0.0
     return (
         f"The residual does not grow with the inputs: it is {rms[0]:.3g} times the noise in record {quiet!r} and"
         f" {rms[-1]:.3g} times in {loud!r}, whose inputs are {high / low:.2g} times as large. Possible causes are an"
-        " excitation that is not measured (measure it, or keep it away), noise that is louder than stated, and a force"
+        " excitation that is not measured (measure it, or keep it away), noise above that stated, and a force"
         " of constant size, such as dry friction or play."
     )
 

@@ -57,7 +57,7 @@ class Attribution:
         ahead: the best fit of each kind alone to one-step-ahead predictions.
         evidence: of the nominal rig.
         search: records (with the noise of rounded sensors), rig and candidate kinds of the search.
-        weighed: the records that the best set was fitted to, whitened for input noise if there is some.
+        whitened: the records that the best set was fitted to, whitened for input noise if there is some.
         noise: (n_outputs,) estimated standard deviation of each sensor's noise, in its unit.
         logged: input noise estimated from the residual, as a share of the inputs' rms.
         seen: effects that show in the readings themselves, which no fit alters.
@@ -75,7 +75,7 @@ class Attribution:
     ahead: tuple[Fit, ...]
     evidence: Evidence
     search: Search
-    weighed: FitData
+    whitened: FitData
     noise: np.ndarray
     logged: float
     seen: tuple[Effect, ...] = ()
@@ -99,8 +99,8 @@ class Attribution:
         """The attribution without some effects; the others are refitted, with new intervals."""
         search = self.search
         others = [e for e in self.best.effects if e not in effects and not e.is_in_readings]
-        best = _refitted(search, others, self.weighed)
-        best = with_intervals(search.rig, best, self.weighed, search.workers, logged=self.logged)
+        best = _refitted(search, others, self.whitened)
+        best = with_intervals(search.rig, best, self.whitened, search.workers, logged=self.logged)
         best = replace(best, effects=(*self.seen, *best.effects))
         return replace(self, best=best, noise=search.noise_with(best))
 
@@ -277,7 +277,7 @@ def attribute(
         ahead=tuple(stages.ahead),
         evidence=nominal,
         search=search,
-        weighed=final_search.data,
+        whitened=final_search.data,
         noise=noise,
         logged=logged,
         seen=seen,
@@ -302,7 +302,7 @@ def _with_one_for_two(search: Search, best: Fit) -> Fit:
         ahead = one_more(narrow, rest, search.evidence_with(rest))
         for fewer in on_whole_records(narrow, ahead, PAIRS.more):
             extra = max(best.n_parameters - fewer.n_parameters, 0)
-            if search.explains(fewer) and not search.tells_apart(here, fewer.cost, extra):
+            if search.explains(fewer) and not search.distinguishes(here, fewer.cost, extra):
                 return fewer
     return best
 
@@ -345,7 +345,7 @@ def _significant(search: Search, best: Fit, seen: Sequence[Effect], logged: floa
         here = cost_of(rig, best.effects, data)
         simpler = [_refitted(search, each, search.data) for each in sets]
         for fewer in sorted(simpler, key=lambda f: f.n_parameters):
-            if not search.tells_apart(here, fewer.cost, max(best.n_parameters - fewer.n_parameters, 0)):
+            if not search.distinguishes(here, fewer.cost, max(best.n_parameters - fewer.n_parameters, 0)):
                 fewer = with_intervals(rig, fewer, search.data, search.workers, logged=logged)
                 settled = _without_negligible_parameters(search, fewer).effects
                 return _significant(search, replace(fewer, effects=(*seen, *settled)), seen, logged)
@@ -386,7 +386,7 @@ def _without_negligible_parameters(search: Search, best: Fit) -> Fit:
             continue
         effects = tuple(settled if e is effect else e for e in best.effects)
         here, there = (cost_of(search.rig, each, data) for each in (best.effects, effects))
-        if not search.tells_apart(here, there, 1):
+        if not search.distinguishes(here, there, 1):
             best = replace(best, effects=effects)
     return best
 
@@ -407,7 +407,7 @@ def with_identified_errors(search: Search, best: Fit, identified: IdentifiedPrio
     while len(found.effects) > 2:
         *effects, errors = found.effects
         fewer = min((fitted_with(some, errors) for some in each_left_out(effects)), key=lambda f: f.cost)
-        if search.tells_apart(found.cost, fewer.cost, found.n_parameters - fewer.n_parameters):
+        if search.distinguishes(found.cost, fewer.cost, found.n_parameters - fewer.n_parameters):
             break
         found = fewer
     return replace(found, effects=(*seen, *found.effects))

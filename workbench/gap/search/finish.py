@@ -81,7 +81,7 @@ def widened(search: Search, found: Fit) -> Fit:
         trial = refitted(effects)
         extra = trial.n_parameters - found.n_parameters
         # refitting the other parameters lowers the cost of the original set too
-        if search.tells_apart(trial.cost, cost, extra) and search.tells_apart(
+        if search.distinguishes(trial.cost, cost, extra) and search.distinguishes(
             trial.cost, refitted(found.effects).cost, extra
         ):
             return trial
@@ -186,7 +186,7 @@ def plainest(search: Search, fits: Sequence[Fit], *, worth: float = 0.0) -> list
 
 def _pays(search: Search, candidate: Fit, simpler: Fit) -> bool:
     """Whether the gain of a set over a simpler one justifies its additional parameters, at least one."""
-    return search.tells_apart(candidate.cost, simpler.cost, max(candidate.n_parameters - simpler.n_parameters, 1))
+    return search.distinguishes(candidate.cost, simpler.cost, max(candidate.n_parameters - simpler.n_parameters, 1))
 
 
 def simplest(search: Search, candidate: Fit) -> Fit:

@@ -17,7 +17,7 @@ from workbench.gap.search.settings import FIT
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
 
-HOPELESS = 1e300
+DIVERGED = 1e300
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,9 +61,9 @@ class Fit:
 
 
 def cost_of(rig: Rig, effects: Sequence[Effect], data: FitData) -> float:
-    """Cost per measured value; `HOPELESS` if the rig is physically impossible (a buckled beam, say)."""
+    """Cost per measured value; `DIVERGED` if the rig is physically impossible (a buckled beam, say)."""
     residual = finite_residual(rig, effects, data)
-    return HOPELESS if residual is None else float(residual @ residual) / residual.size
+    return DIVERGED if residual is None else float(residual @ residual) / residual.size
 
 
 def finite_residual(rig: Rig, effects: Sequence[Effect], data: FitData) -> np.ndarray | None:
@@ -73,7 +73,7 @@ def finite_residual(rig: Rig, effects: Sequence[Effect], data: FitData) -> np.nd
             residual = data.residual(apply_all(rig, effects))
         except (ValueError, np.linalg.LinAlgError):
             return None
-        return residual if residual @ residual < HOPELESS else None
+        return residual if residual @ residual < DIVERGED else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,7 @@ class Attempt:
         coarsely: whether the sensitivities there are simulated with coarse substeps.
         normal, gradient: Jᵀ J and Jᵀ r there.
         damping: as a share of the diagonal of Jᵀ J.
-        worth: least predicted decrease of the cost for which the step is tried.
+        least_decrease: least predicted decrease of the cost for which the step is tried.
     """
 
     free: Floats
@@ -112,7 +112,7 @@ class Attempt:
     normal: Floats
     gradient: Floats
     damping: float
-    worth: float
+    least_decrease: float
 
 
 Shared = Callable[[Sequence[Move | Attempt]], list[Any]]
@@ -240,7 +240,7 @@ class _Problem:
         diagonal = np.maximum(np.diag(normal), 1e-12 * max(np.diag(normal).max(), 1e-300))
         damped = normal + attempt.damping * np.diag(diagonal)
         straight, moving = self._damped_step(free, attempt.gradient, damped)
-        if -(2.0 * attempt.gradient + normal @ straight) @ straight < attempt.worth:
+        if -(2.0 * attempt.gradient + normal @ straight) @ straight < attempt.least_decrease:
             return None
         curved = straight + self._geodesic_acceleration(attempt, damped, straight, moving)
         to = free + self._bounded_step(free, curved)
@@ -454,7 +454,7 @@ def fit(
     residual = problem.residual(problem.start)
     if residual is None:
         shape = (len(data.records), data.noise.size)
-        return Fit(tuple(effects), HOPELESS, np.full(shape, HOPELESS), problem.start.size)
+        return Fit(tuple(effects), DIVERGED, np.full(shape, DIVERGED), problem.start.size)
     with workers.pool(problem.run) as share:
         found = _minimised(problem, share, residual, iterations, tolerance, damping)
     problem.store_chord()
@@ -478,8 +478,8 @@ def _minimised(
         jacobian = problem.jacobian(free, base, coarsely, share)
         normal, gradient = problem.normal(jacobian), jacobian.T @ residual
         dampings = accumulate([damping, *[FIT.less_far] * (FIT.attempts - 1)], mul)
-        worth = FIT.promised * tolerance * cost
-        attempts = (Attempt(free, coarsely, normal, gradient, each, worth) for each in dampings)
+        least_decrease = FIT.promised * tolerance * cost
+        attempts = (Attempt(free, coarsely, normal, gradient, each, least_decrease) for each in dampings)
         found = _first_descent(cost, attempts, share, problem.workers.at_once)
         if found is None:
             falling = 0.0

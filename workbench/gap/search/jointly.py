@@ -126,13 +126,13 @@ def _gain(search: Search, best: JointFit, step: JointFit) -> float:
 def is_likelier(search: Search, best: JointFit, step: JointFit, least: float = SEARCH.significant) -> bool:
     """Whether the likelihood surely prefers a set to a smaller one, beyond the imperfection of any model."""
     extra, gain = max(best.fit.n_parameters - step.fit.n_parameters, 1), _gain(search, best, step)
-    return gain > least and search.pays(gain, extra)
+    return gain > least and search.is_justified(gain, extra)
 
 
 def surely_prefers(search: Search, best: JointFit, simpler: JointFit) -> bool:
     """Whether the best step explains the records and its likelihood is surely higher than that of a simpler one."""
     extra, gain = best.fit.n_parameters - simpler.fit.n_parameters, _gain(search, best, simpler)
-    return best.explains and search.pays(gain, extra)
+    return best.explains and search.is_justified(gain, extra)
 
 
 def fit_jointly(

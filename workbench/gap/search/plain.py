@@ -143,7 +143,7 @@ def _is_surely_worse(search: Search, found: Fit, step: JointFit, data: FitData) 
         return False
     gain = float(np.log(found.cost / cost_of(search.rig, step.fit.effects, data)))
     extra = max(step.fit.n_parameters - found.n_parameters, 0)
-    return search.pays(gain, extra, data.n_values)
+    return search.is_justified(gain, extra, data.n_values)
 
 
 def _with_reading_sides(search: Search, effects: tuple[Effect, ...]) -> tuple[Effect, ...]:

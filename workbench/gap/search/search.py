@@ -17,7 +17,7 @@ from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import ForceFilter
 from workbench.gap.prediction.workers import Workers
-from workbench.gap.search.fit import HOPELESS, Fit, cost_of, finite_residual, sensitivity
+from workbench.gap.search.fit import DIVERGED, Fit, cost_of, finite_residual, sensitivity
 from workbench.gap.search.settings import SEARCH
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Domain, NamedPoints
@@ -123,11 +123,11 @@ class Search:
             self.surely_better(candidate, than, candidate.n_parameters) and than - candidate.cost > SEARCH.significant
         )
 
-    def tells_apart(self, better: float, cost: float, extra: int) -> bool:
+    def distinguishes(self, better: float, cost: float, extra: int) -> bool:
         """Whether the lower of two costs is surely and not negligibly better, given `extra` more parameters."""
-        return self.pays(float(np.log(cost / better)), extra)
+        return self.is_justified(float(np.log(cost / better)), extra)
 
-    def pays(self, gain: float, extra: int, n_values: int | None = None) -> bool:
+    def is_justified(self, gain: float, extra: int, n_values: int | None = None) -> bool:
         """Whether a gain justifies `extra` more parameters, and is not negligible.
 
         Args:
@@ -297,7 +297,7 @@ def most_informative(data: FitData, by_channel: np.ndarray) -> tuple[FitData, Fi
 
 def best_of_each_kind(fits: Sequence[Fit]) -> list[Fit]:
     """The first fit for each kind of its last effect, in the order of the fits; failed ones are left out."""
-    return first_of_each((f for f in fits if f.cost < HOPELESS), lambda f: f.effects[-1].kind.name)
+    return first_of_each((f for f in fits if f.cost < DIVERGED), lambda f: f.effects[-1].kind.name)
 
 
 def best_of_each(fits: Iterable[Fit]) -> list[Fit]:

@@ -177,7 +177,7 @@ class PlainSettings:
     """Constants of few effects in place of many nominal errors."""
 
     plainly: int = 8  # iterations without nominal errors
-    briefly: int = 3  # of these, iterations before hopeless fits are dropped
+    briefly: int = 3  # of these, iterations before fits far from the best are dropped
     near: float = 2.0  # times the noise power on the most informative records: fits above it go no further
     needless: float = 6.0  # twice the log-likelihood ratio that one more parameter may gain by chance
     likeliest: int = 4  # kinds that are tried as the one additional effect
@@ -339,7 +339,7 @@ class AttributionSettings:
     laws: int = 2  # one-step-ahead fits of a law beyond the catalogue that are continued on whole records
     shown: int = 7  # other single effects that are fitted only for display
     a_tenth: float = 1.1**2 - 1.0  # excess power of noise that is a tenth larger in amplitude
-    very_near: float = 0.01  # of the gap's power: largest residual of an effect that leaves only louder noise
+    very_near: float = 0.01  # of the gap's power: largest residual of an effect that leaves only more noise than stated
     # likewise of modes that are missing and are added before another effect is sought: a cantilever by finite elements
     # with a spring to ground left 0.06, and without them an added mass was named. One with an added mass of 3 % left
     # 0.8, and the number of modes was wrong

@@ -71,7 +71,7 @@ class Stages:
         return Decision("none", self.start) if not self.start.effects and self._is_small else None
 
     def noise_alone(self) -> Decision | None:
-        """Noise louder than stated."""
+        """More noise than stated."""
         residuals = self.evidence.residuals
         if self.is_explained_by_none or not is_noise_alone(residuals, self.search.data.counted):
             return None
@@ -140,7 +140,7 @@ class Stages:
         return self._if_significant(decision)
 
     def single_in_louder_noise(self) -> Decision | None:
-        """One effect and noise louder than stated: fewer parameters than nominal errors that fit equally well."""
+        """One effect and more noise than stated: fewer parameters than nominal errors that fit equally well."""
         search, stated, best = self.search, self.search.data.noise, self.singles[0] if self.singles else self.start
         under_errors = np.sqrt(self.stepwise.last.sensor_noise) * stated
         noise = np.clip(search.noise_with(best), stated, (1.0 + ATTRIBUTION.a_tenth) ** 0.5 * under_errors)

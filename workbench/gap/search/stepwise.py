@@ -432,7 +432,7 @@ class Stepwise:
     def _with_law_elsewhere(self, step: JointFit) -> JointFit | None:
         """The step with its one nonlinear law at another place, if that is likelier; tried above the stated noise.
 
-        A law at a wrong place may leave no more than noise that is a little louder than stated.
+        A law at a wrong place may leave no more than a little more noise than stated.
         """
         effect = _law_of(step)
         if effect is None or effect.at is None or not step.explains or self.search.explains(step.fit):

@@ -42,7 +42,7 @@ class ChangingResponseSettings:
     largest: float = 1e3  # times the amplitude of the constant mode: beyond this a motion diverges
     # logarithm of the squares beyond those that the linear modes leave, from which a law is given up after its first
     # step. Of laws that were right in the end it was 1 at most, of two linear modes in place of one it is 4 to 9
-    hopeless: float = 2.5
+    given_up: float = 2.5
     # the same of the law of time, from which no other law is tried. It was 3.5 at most where one of amplitude was right
     linear: float = 5.0
     # evaluations within which the same must fall, by a share of what is left or by the least that counts. Laws that
@@ -70,7 +70,7 @@ LAWS: tuple[Law, ...] = (
 
 @dataclass(eq=False)
 class _GivenUp(Exception):
-    """A law is hopeless after its first step or falls no more, or the time is spent.
+    """A law is far off after its first step or falls no more, or the time is spent.
 
     Attributes:
         least: logarithm of the squares beyond the threshold.
@@ -334,8 +334,8 @@ class _Response:
             beyond.append(float(np.log(_squares(residual))) - threshold)
             if beyond[-1] < least:
                 best[:], least = unknowns, beyond[-1]
-            hopeless = len(beyond) == 2 and least > RESPONSE.hopeless
-            if hopeless or before - least < max(RESPONSE.stalled * least, RESPONSE.settled):
+            given_up = len(beyond) == 2 and least > RESPONSE.given_up
+            if given_up or before - least < max(RESPONSE.stalled * least, RESPONSE.settled):
                 raise _GivenUp(least)
             return residual
 
