@@ -168,15 +168,15 @@ def test_identify_reads_transfer_functions(tmp_path):
 
 def test_designs_and_placements_are_told_in_the_units_of_the_file(rig, tmp_path):
     rig.write_text(rig.read_text() + '[units]\nlength = "mm"\nmass = "t"\ntime = "s"\nforce = "N"\n')
-    laws = run("design", rig, "--control", 4, "--weight", 20).output
+    laws = run("design", rig, "--controlled-modes", 4, "--weight", 20).output
     assert "W_C [N mm]  W_R [N mm]" in laws and "R weights FᵀF" in laws
-    placed = run("place", rig, "--control", 2, "--figure", tmp_path / "places.png")
+    placed = run("place", rig, "--controlled-modes", 2, "--figure", tmp_path / "places.png")
     assert "places [mm]" in placed.output and "W_R [N mm]" in placed.output and (tmp_path / "places.png").is_file()
 
 
 def test_design_reports_the_works_of_section_5_8(rig, tmp_path):
     found = tmp_path / "design.json"
-    result = run("design", rig, "--control", 4, "--weight", 20, "--final-time", 3000, "--json", found)
+    result = run("design", rig, "--controlled-modes", 4, "--weight", 20, "--final-time", 3000, "--json", found)
     assert result.exit_code == 0, result.output
     written = json.loads(found.read_text())
     imsc, coupled = written["laws"]
@@ -195,24 +195,24 @@ def test_design_has_observers_of_rigid_modes_and_says_what_is_on_the_axis(tmp_pa
     free = tmp_path / "free.toml"
     second = '[[output]]\nname = "z"\nquantity = "displacement"\nat = 7.5\n'  # two rigid modes take two sensors
     free.write_text(RIG.replace('"hinged"', '"free"') + second)
-    result = run("design", free, "--control", 2)
+    result = run("design", free, "--controlled-modes", 2)
     assert result.exit_code == 0 and "IMSC on a Luenberger observer" in result.output, result.output
     # two undamped laws, through exact modal coordinates: whatever rounding makes of poles on the axis
     assert [line.split()[-2:] for line in result.output.splitlines()[2:4]] == [["marginally", "stable"]] * 2
-    by_ratio = run("design", free, "--control", 2, "--damping", 0.2)
+    by_ratio = run("design", free, "--controlled-modes", 2, "--damping", 0.2)
     assert by_ratio.exit_code == 0 and "the rigid mode(s) 1, 2 have no damping ratio" in by_ratio.output, (
         by_ratio.output
     )
     free.write_text(free.read_text().replace("modes = 9", "modes = 2"))
-    assert "without elastic modes the final time" in run("design", free, "--control", 2).output
+    assert "without elastic modes the final time" in run("design", free, "--controlled-modes", 2).output
 
 
 def test_design_offers_what_can_be_had(rig, tmp_path):
     found = tmp_path / "design.json"
-    nodes = run("design", rig, "--control", 5)
+    nodes = run("design", rig, "--controlled-modes", 5)
     assert nodes.exit_code == 2 and "mode 5 is uncontrollable: all actuators are at its nodes" in nodes.output
     rig.write_text(rig.read_text().replace("at = 4.0", "at = 4.3"))
-    few = run("design", rig, "--control", 5, "--damping", 0.1, "--errors", 0.02, "--json", found)
+    few = run("design", rig, "--controlled-modes", 5, "--damping", 0.1, "--errors", 0.02, "--json", found)
     assert "stable of 100 models with 2 % error" in few.output
     assert few.exit_code == 0 and "IMSC needs as many actuators as controlled modes, 5; there are 4" in few.output
     told = json.loads(found.read_text())
@@ -224,7 +224,7 @@ def test_design_offers_what_can_be_had(rig, tmp_path):
 
 def test_place_does_better_than_even_places(rig, tmp_path):
     found = tmp_path / "places.json"
-    result = run("place", rig, "--control", 4, "--weight", 20, "--json", found)
+    result = run("place", rig, "--controlled-modes", 4, "--weight", 20, "--json", found)
     assert result.exit_code == 0, result.output
     best, even, nodes = json.loads(found.read_text())["placements"]
     assert best["residual_work"] < min(even["residual_work"], nodes["residual_work"])
@@ -247,7 +247,7 @@ def test_patches_on_a_beam_are_placed_beside_each_other(tmp_path):
         f'right = "free"\nmodes = 6\ndamping_ratio = 0.004\n{inputs}[[input]]\nname = "hammer"\nkind = "hammer"\n'
         'at = 0.9\n[[output]]\nname = "y"\nquantity = "displacement"\nat = 0.4\nnoise_std = 1e-6\n'
     )
-    result = run("place", path, "--control", 2, "--effort", 3, "--json", found)
+    result = run("place", path, "--controlled-modes", 2, "--effort-ratio", 3, "--json", found)
     assert result.exit_code == 0, result.output
     first, second = json.loads(found.read_text())["placements"][0]["positions"]
     assert second - first >= 0.4 - 1e-6 and "overlap" not in result.output
@@ -257,7 +257,7 @@ def test_patches_on_a_beam_are_placed_beside_each_other(tmp_path):
 def test_a_placement_is_proven_under_every_limit(rig, tmp_path):
     found = tmp_path / "places.json"
     limits = ("--peak-force", 0.5, "--condition", 3, "--forbid", "4.9:5.6", "--certify", 0.05)
-    result = run("place", rig, "--control", 2, "--weight", 20, *limits, "--json", found)
+    result = run("place", rig, "--controlled-modes", 2, "--weight", 20, *limits, "--json", found)
     assert result.exit_code == 0, result.output
     written = json.loads(found.read_text())
     bound = f"W_R below {written['lower_bound']:.4g} J, 5 % under that of the one found"
@@ -270,8 +270,8 @@ def test_a_placement_is_proven_under_every_limit(rig, tmp_path):
 
 def test_places_are_chosen_from_those_there_are(rig, tmp_path):
     found = tmp_path / "places.json"
-    given = ("--at", "1.5,3,4.5,6.5,7,8.5", "--effort", 3, "--certify", 0.05)
-    result = run("place", rig, "--control", 3, "--weight", 20, *given, "--json", found)
+    given = ("--at", "1.5,3,4.5,6.5,7,8.5", "--effort-ratio", 3, "--certify", 0.05)
+    result = run("place", rig, "--controlled-modes", 3, "--weight", 20, *given, "--json", found)
     assert result.exit_code == 0, result.output
     assert re.search(r"certified: .* W_R below \S+ J, that of the one found", result.output)
     assert set(json.loads(found.read_text())["placements"][0]["positions"]) <= {1.5, 3, 4.5, 6.5, 7, 8.5}
@@ -323,9 +323,9 @@ def test_an_input_at_a_node_is_placed_at_its_point_in_its_direction(tmp_path):
         f'points = "points.csv"\n{inputs}[[output]]\nname = "y"\nquantity = "displacement"\npoint = "2y"\n'
         "noise_std = 1.0\n"
     )
-    result = run("place", tmp_path, "--control", 1)
+    result = run("place", tmp_path, "--controlled-modes", 1)
     assert result.exit_code == 0 and "unit impulse at 2y" in result.output, result.output
-    assert run("design", tmp_path, "--control", 1).exit_code == 0
+    assert run("design", tmp_path, "--controlled-modes", 1).exit_code == 0
 
 
 @pytest.fixture
@@ -338,7 +338,7 @@ def plate(tmp_path):
 def test_a_plate_is_placed_outside_a_zone_and_drawn(plate, tmp_path):
     found, picture = tmp_path / "places.json", tmp_path / "places.png"
     zone = ("--forbid", "0.3,0.2:0.6,0.5")
-    result = run("place", plate, "--control", 2, "--weight", 0.01, *zone, "--figure", picture, "--json", found)
+    result = run("place", plate, "--controlled-modes", 2, "--weight", 0.01, *zone, "--figure", picture, "--json", found)
     assert result.exit_code == 0, result.output
     assert "unit impulse at (x, y) = (0.5, 0.46)" in result.output and "places [m]" in result.output
     best, own = json.loads(found.read_text())["placements"]
@@ -350,8 +350,8 @@ def test_a_plate_is_placed_outside_a_zone_and_drawn(plate, tmp_path):
 
 def test_candidates_of_a_plate_are_proven(plate, tmp_path):
     found = tmp_path / "places.json"
-    given = ("--at", "0.3,0.24; 0.4,0.4; 0.8,0.4; 0.84,0.52; 1.0,0.4", "--effort", 3, "--certify", 0.05)
-    result = run("place", plate, "--control", 2, "--weight", 0.01, *given, "--json", found)
+    given = ("--at", "0.3,0.24; 0.4,0.4; 0.8,0.4; 0.84,0.52; 1.0,0.4", "--effort-ratio", 3, "--certify", 0.05)
+    result = run("place", plate, "--controlled-modes", 2, "--weight", 0.01, *given, "--json", found)
     assert result.exit_code == 0, result.output
     # modes (1, 1) and (2, 1) from a third and two thirds of the length on the midline: nothing reaches (1, 2) or (3, 1)
     assert json.loads(found.read_text())["placements"][0]["positions"] == [[0.4, 0.4], [0.8, 0.4]]
@@ -360,7 +360,18 @@ def test_candidates_of_a_plate_are_proven(plate, tmp_path):
 def test_a_grid_over_a_plate_is_proven(plate, tmp_path):
     """Nodes of a grid that keep out of the zone; its best choice is within the proof of all of them."""
     found = tmp_path / "places.json"
-    given = ("--control", 2, "--weight", 0.01, "--forbid", "0.3,0.2:0.6,0.5", "--effort", 3, "--certify", 0.05)
+    given = (
+        "--controlled-modes",
+        2,
+        "--weight",
+        0.01,
+        "--forbid",
+        "0.3,0.2:0.6,0.5",
+        "--effort-ratio",
+        3,
+        "--certify",
+        0.05,
+    )
     result = run("place", plate, *given, "--grid", 0.1, "--json", found)
     assert result.exit_code == 0, result.output
     best, written = json.loads(found.read_text())["placements"][0], json.loads(found.read_text())
@@ -379,7 +390,7 @@ def test_a_grid_over_a_plate_is_proven(plate, tmp_path):
 
 def test_laws_on_a_plate_are_compared_through_a_filter_and_an_observer(plate, tmp_path):
     found = tmp_path / "laws.json"
-    result = run("design", plate, "--control", 2, "--weight", 0.01, "--json", found)
+    result = run("design", plate, "--controlled-modes", 2, "--weight", 0.01, "--json", found)
     assert result.exit_code == 0, result.output
     through = json.loads(found.read_text())["through_sensors"]
     ways = ("through a modal filter", "on a Luenberger observer")
@@ -393,16 +404,16 @@ def test_patches_on_a_plate_are_placed_and_designed(plate, tmp_path):
         text = text.replace(f"at = {at}", f"at = {at}\npatch = [0.2, 0.15]")
     plate.write_text(text)
     found = tmp_path / "places.json"
-    result = run("place", plate, "--control", 2, "--weight", 10, "--json", found)
+    result = run("place", plate, "--controlled-modes", 2, "--weight", 10, "--json", found)
     assert result.exit_code == 0, result.output
     assert "effort [(N m/m)² s]  peak moment [N m/m]" in result.output  # a line moment along the edges
     best, own = json.loads(found.read_text())["placements"]
     assert own["positions"] == [[0.3, 0.24], [0.84, 0.52]] and best["residual_work"] < own["residual_work"]
     assert all(0.1 <= x <= 1.1 and 0.075 <= y <= 0.725 for x, y in best["positions"])
-    result = run("design", plate, "--control", 2, "--weight", 10)
+    result = run("design", plate, "--controlled-modes", 2, "--weight", 10)
     assert result.exit_code == 0 and "effort [(N m/m)² s]  peak moment [N m/m]" in result.output, result.output
     plate.write_text(text.replace("patch = [0.2, 0.15]", "patch = [0.2, 0.1]", 1))
-    result = run("place", plate, "--control", 2)
+    result = run("place", plate, "--controlled-modes", 2)
     assert result.exit_code == 2 and "F2 is not a patch like F1" in " ".join(result.output.split())
 
 
@@ -413,11 +424,11 @@ def test_patches_on_a_plate_are_placed_and_designed(plate, tmp_path):
         (("--impulse-at", "0.4"), "--impulse-at takes X,Y in m, such as 0.4,0.25; got '0.4'"),
         (("--forbid", "0.2:0.3"), "--forbid takes X,Y in m, such as 0.4,0.25; got '0.2'"),
         (("--at", "0.2,0.3"), "2 actuators need as many places; the limits allow 1"),
-        (("--control", 3), "there are 2 for 3 modes: describe 3 [[input]] of kind actuator"),
+        (("--controlled-modes", 3), "there are 2 for 3 modes: describe 3 [[input]] of kind actuator"),
     ],
 )
 def test_places_that_a_plate_does_not_have_are_refused(plate, arguments, words):
-    result = run("place", plate, "--control", 2, *arguments)
+    result = run("place", plate, "--controlled-modes", 2, *arguments)
     assert result.exit_code == 2, result.output
     assert words in " ".join(result.output.split())
 
@@ -433,30 +444,42 @@ def test_places_that_a_plate_does_not_have_are_refused(plate, arguments, words):
         (("design", "{rig}", "--errors", 0), "--errors is a share between 0 and 1, 0.05 for 5 %; got 0"),
         (("design", "{rig}", "--errors", 5), "a share between 0 and 1, 0.05 for 5 %; got 5"),
         (("design", "{rig}", "--weight", -1), "--weight must be positive; got -1"),
-        (("place", "{rig}", "--control", 4, "--weight", -1), "--weight must be positive; got -1"),
-        (("place", "{rig}", "--control", 4, "--figure", "a.xyz"), "--figure writes .png, .svg, .pdf"),
+        (("place", "{rig}", "--controlled-modes", 4, "--weight", -1), "--weight must be positive; got -1"),
+        (("place", "{rig}", "--controlled-modes", 4, "--figure", "a.xyz"), "--figure writes .png, .svg, .pdf"),
         (("trial", "{rig}", "--figure", "a"), "name a file such as a.png; got a"),
         (("look", "nowhere.csv", "--page", "p.pdf"), "--page writes HTML; name a file such as p.html; got p.pdf"),
         (("report", "nowhere.json", "--page", "p"), "--page writes HTML; name a file such as p.html; got p"),
-        (("design", "{rig}", "--control", -1), "controlled modes is 1 to 9, those of the model; got -1"),
+        (("design", "{rig}", "--controlled-modes", -1), "controlled modes is 1 to 9, those of the model; got -1"),
         (("design", "{rig}", "--final-time", -1), "final time must be positive and finite; got -1"),
         (("design", "{rig}", "--final-time", 0), "final time must be positive and finite; got 0"),
         (("design", "{rig}", "--json", "nowhere/found.json"), "there is no folder nowhere"),
-        (("place", "{rig}", "--control", 4, "--json", "nowhere/found.json"), "there is no folder nowhere"),
+        (("place", "{rig}", "--controlled-modes", 4, "--json", "nowhere/found.json"), "there is no folder nowhere"),
         (
-            ("place", "{rig}", "--control", 4, "--forbid", "0.5:10"),
+            ("place", "{rig}", "--controlled-modes", 4, "--forbid", "0.5:10"),
             "only 2 find room on the allowed intervals, 0 to 0.5 m:",
         ),
-        (("place", "{rig}", "--control", 9), "residual"),
-        (("place", "{rig}", "--control", 4, "--grid", 0.1), "--grid is for a plate; name candidate places by --at"),
-        (("place", "{rig}", "--control", 1, "--effort", 0.01), "raise --effort or lower --spacing; --effort is a"),
-        (("place", "{rig}", "--control", 1, "--effort", -1), "--effort is a multiple, above 0, of the effort at even"),
-        (("place", "{rig}", "--control", 2, "--peak-force", 0.01), "meets the limits: --peak-force is 0.01 N with a"),
-        (("place", "{rig}", "--control", 2, "--peak-force", -1), "--peak-force must be positive; got -1"),
-        (("place", "{rig}", "--control", 2, "--spacing", -1), "--spacing must be 0 or more; got -1"),
-        (("place", "{rig}", "--control", 4, "--impulse-at", 11), "outside the structure"),
-        (("place", "{rig}", "--control", 4, "--at", "1,2,3,11"), "outside the structure"),
-        (("place", "{rig}", "--control", 4, "--at", "1 to 9"), "separated by commas"),
+        (("place", "{rig}", "--controlled-modes", 9), "residual"),
+        (
+            ("place", "{rig}", "--controlled-modes", 4, "--grid", 0.1),
+            "--grid is for a plate; name candidate places by --at",
+        ),
+        (
+            ("place", "{rig}", "--controlled-modes", 1, "--effort-ratio", 0.01),
+            "raise --effort-ratio or lower --spacing; --effort-ratio is a",
+        ),
+        (
+            ("place", "{rig}", "--controlled-modes", 1, "--effort-ratio", -1),
+            "--effort-ratio is a multiple, above 0, of the effort at even",
+        ),
+        (
+            ("place", "{rig}", "--controlled-modes", 2, "--peak-force", 0.01),
+            "meets the limits: --peak-force is 0.01 N with a",
+        ),
+        (("place", "{rig}", "--controlled-modes", 2, "--peak-force", -1), "--peak-force must be positive; got -1"),
+        (("place", "{rig}", "--controlled-modes", 2, "--spacing", -1), "--spacing must be 0 or more; got -1"),
+        (("place", "{rig}", "--controlled-modes", 4, "--impulse-at", 11), "outside the structure"),
+        (("place", "{rig}", "--controlled-modes", 4, "--at", "1,2,3,11"), "outside the structure"),
+        (("place", "{rig}", "--controlled-modes", 4, "--at", "1 to 9"), "separated by commas"),
         (("diagnose", "nowhere"), "not a folder"),
         (("study", "nothing_of_that_name"), "no study is called"),
         (("report", "nowhere.json"), "no such file"),
@@ -480,7 +503,7 @@ def test_damping_in_per_cent_is_no_design(rig, tmp_path, command):
     text = rig.read_text()
     (written,) = {line for line in text.splitlines() if line.startswith("damping_ratio")}
     (tmp_path / "percent.toml").write_text(text.replace(written, "damping_ratio = 3"))
-    refused = run(command, tmp_path / "percent.toml", "--control", 4)
+    refused = run(command, tmp_path / "percent.toml", "--controlled-modes", 4)
     assert refused.exit_code == 2
     assert "a share of critical damping, below 1, such as 0.02 for 2 %; got 3" in refused.output
 

@@ -82,7 +82,7 @@ def test_the_damping_that_a_law_gives_is_told(run, rig, tmp_path, law, asked):
         given = ((4 * 0.02**2 + 2 * asked**2 + 2 * (x - 1)) / (4 * x)) ** 0.5
     rig.write_text(RIG.replace("damping_ratio = 0.01", "damping_ratio = 0.02"))
     options = ("--law", law, "--damping", asked, "--rate-hz", 1000, "--to", tmp_path / "one.py")
-    result = run("export", rig, "--control", 1, *options)
+    result = run("export", rig, "--controlled-modes", 1, *options)
     assert f"with exact modal coordinates: {100 * given:.3g} %\n" in result.output, result.output
 
 

@@ -59,7 +59,7 @@ def test_a_late_actuator_is_made_up_for_and_shown(run, case, tmp_path):
 @pytest.mark.slow
 def test_what_is_redesigned_is_what_was_exported(run, case, tmp_path):
     folder, verdict = case
-    options = ("--law", "poles", "--control", 2, "--damping", 0.15, "--estimator", "luenberger")
+    options = ("--law", "poles", "--controlled-modes", 2, "--damping", 0.15, "--estimator", "luenberger")
     code, told = tmp_path / "before.py", tmp_path / "kept.py"
     done = run("export", folder, *options, "--rate-hz", 100, "--to", code)
     assert done.exit_code == 0, done.output
@@ -128,7 +128,7 @@ def test_a_damaged_verdict_is_named(run, case, tmp_path, change, said):
         ("--impulse-at", 9.0, "lies outside the structure"),
         ("--impulse-at", "F9", "or name an input: F1, F2"),
         ("--impulse-at", 0, "excites none of the controlled modes"),
-        ("--control", 7, "controlled modes is 1 to 5, those of the model; got 7"),
+        ("--controlled-modes", 7, "controlled modes is 1 to 5, those of the model; got 7"),
         ("--to", "anew.m", ".c, .py or .mat"),
         ("--to", "no/anew.c", "make it first"),
         ("--page", ".", "is a folder; name a file in it"),

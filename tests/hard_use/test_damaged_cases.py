@@ -274,7 +274,7 @@ def test_a_design_on_a_damaged_structure_is_one_or_a_refusal(whole, tmp_path, co
         path.write_text("\n".join(f"{key} = {as_toml(value)}" for key, value in table.items()))
         found.unlink(missing_ok=True)
         start = clock.process_time()
-        result = CliRunner().invoke(app, ["design", str(path), "--control", "1", "--json", str(found)])
+        result = CliRunner().invoke(app, ["design", str(path), "--controlled-modes", "1", "--json", str(found)])
         assert clock.process_time() - start < LONGEST, table
         assert result.exit_code in (0, 2) and "Traceback" not in result.output, result.output[-1000:]
         assert found.exists() == (result.exit_code == 0)

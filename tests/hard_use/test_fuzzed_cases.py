@@ -308,7 +308,7 @@ def test_a_case_of_the_grammar_is_what_it_tells_or_refused(tmp_path, count=48):
         else:
             check_told(case, folder)
         if seed % 4 == 0:
-            result = CliRunner().invoke(app, ["design", str(folder), "--control", "1", "--impulse-at", first])
+            result = CliRunner().invoke(app, ["design", str(folder), "--controlled-modes", "1", "--impulse-at", first])
             assert result.exit_code in (0, 2) and "Traceback" not in result.output, (seed, result.output[-1000:])
         assert process_time() - start < 2 * LONGEST, seed
         shutil.rmtree(folder)

@@ -28,6 +28,8 @@ RENAMED = {
     "proof": "certify",
     "picture": "figure",
     "validate": "validation",
+    "control": "controlled-modes",
+    "effort": "effort-ratio",
 }
 
 

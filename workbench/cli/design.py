@@ -38,7 +38,7 @@ def design(
 
     With more modes than actuators only coupled control is possible.
 
-    Example: workbench design case.toml --control 3 --weight 20 --damping 0.2 --errors 0.05
+    Example: workbench design case.toml --controlled-modes 3 --weight 20 --damping 0.2 --errors 0.05
     """
     import numpy as np
 

@@ -37,7 +37,7 @@ def export(
 
     The loop of all modes is checked with sampling and delay in it; a rate that is too slow is refused.
 
-    Example: workbench export case.toml --control 2 --damping 0.05 --rate-hz 500 --to controller.c
+    Example: workbench export case.toml --controlled-modes 2 --damping 0.05 --rate-hz 500 --to controller.c
     """
     from workbench.design.export.export import export as export_controller
     from workbench.rig.sensors import MEASURED

@@ -15,8 +15,8 @@ InputHold = Annotated[
     str | None,
     typer.Option(
         metavar="HOLD",
-        help="How inputs run between samples: zero (held, as a command), band-limited (as a force measured behind an"
-        " anti-alias filter) or first (straight); as the file says unless given.",
+        help="Intersample behaviour of the inputs: zero (held, as a command), band-limited (as a force measured behind"
+        " an anti-alias filter) or first (straight); as the file says unless given.",
     ),
 ]
 PagePath = Annotated[Path | None, typer.Option("--page", help="HTML file to write; default out/NAME.html.")]
@@ -42,7 +42,10 @@ Weight = Annotated[
 LawName = Annotated[str, typer.Option(help="Control law: imsc, coupled, poles or on-off.")]
 LinearLawName = Annotated[str, typer.Option("--law", help="Control law: imsc, coupled or poles.")]
 Control = Annotated[
-    int | None, typer.Option(help="Number of controlled modes, lowest first; as many as actuators unless given.")
+    int | None,
+    typer.Option(
+        "--controlled-modes", help="Number of controlled modes, lowest first; as many as actuators unless given."
+    ),
 ]
 LawWeight = Annotated[
     float | None,

@@ -31,12 +31,18 @@ IN_JSON = {"residual_work_by_mode": "by_mode"}  # other names there
 @guarded
 def place(
     rig: options.RigPath,
-    control: Annotated[int, typer.Option(help="Number of controlled modes, lowest first, and of actuators.")],
+    control: Annotated[
+        int,
+        typer.Option("--controlled-modes", help="Number of controlled modes, lowest first, and of actuators."),
+    ],
     weight: options.Weight = 1.0,
     impulse_at: options.ImpulseAt = None,
     effort: Annotated[
         float,
-        typer.Option(help="Effort limit, as a multiple of that of even places (beam) or of the rig's own actuators."),
+        typer.Option(
+            "--effort-ratio",
+            help="Effort limit, as a multiple of that of even places (beam) or of the rig's own actuators.",
+        ),
     ] = 1.5,
     spacing: Annotated[
         float | None,
@@ -71,7 +77,7 @@ def place(
 ) -> None:
     """Place actuators, or the piezo patches of a rig, for the least spillover work within given limits.
 
-    Example: workbench place case.toml --control 3 --weight 20 --effort 1.2 --forbid 0.2:0.3 --certify 0.05
+    Example: workbench place case.toml --controlled-modes 3 --weight 20 --effort-ratio 1.2 --certify 0.05
     """
     from workbench.design.laws.law import DesignError
     from workbench.design.placement.certificate import certify
@@ -84,7 +90,7 @@ def place(
     check_target(json_path, picture, figure=picture)
     if not effort > 0:
         raise ValueError(
-            f"--effort is a multiple, above 0, of the effort at even places or the rig's own; got {effort:g}"
+            f"--effort-ratio is a multiple, above 0, of the effort at even places or the rig's own; got {effort:g}"
         )
     if spacing is not None and not 0 <= spacing < math.inf:
         raise ValueError(f"--spacing must be 0 or more; got {spacing:g}")
@@ -120,7 +126,7 @@ def place(
             text = units.named(str(error))
             if "effort" in text:
                 unit = in_unit(reference.effort, units.named(command_headings(unit_of_commands)[0]))
-                text += f"; --effort is a multiple of {unit}, that of actuators {reference.status}"
+                text += f"; --effort-ratio is a multiple of {unit}, that of actuators {reference.status}"
             raise DesignError(text) from error
         certificate = None
         if certified_gap is not None:
@@ -177,20 +183,20 @@ def place(
 
 
 def _reference(task: "PlacementTask", rig: "Rig") -> "Placement":
-    """The placement whose effort is the unit of --effort: evenly spaced along a member, else that of the rig."""
+    """The placement whose effort is the unit of --effort-ratio: evenly spaced along a member, else that of the rig."""
     n = task.n_controlled
     if isinstance(task.modes.domain, Interval):
         return task.placed(task.modes.length * np.arange(1, n + 1) / (n + 1), "evenly spaced")
     own = [middle(a.at) for a in rig.actuators if not a.direct]
     if len(own) != n:
         raise ValueError(
-            f"--effort is relative to the rig's own actuators here, and there are {len(own)} for {n} modes:"
+            f"--effort-ratio is relative to the rig's own actuators here, and there are {len(own)} for {n} modes:"
             f" describe {n} [[input]] of kind actuator"
         )
     found = task.placed(own, "of the rig")
     if not math.isfinite(found.effort):
         raise ValueError(
-            "the rig's own actuators cannot control these modes (B is singular), so --effort has no reference:"
+            "the rig's own actuators cannot control these modes (B is singular), so --effort-ratio has no reference:"
             " move one off the nodal lines"
         )
     return found

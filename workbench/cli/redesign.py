@@ -74,7 +74,7 @@ def redesign(
 
     The options of `workbench export` say which controller is in use; it is designed for the nominal model.
 
-    Example: workbench redesign cases/arm --verdict verdict.json --control 2 --damping 0.05 --to controller.c
+    Example: workbench redesign cases/arm --verdict verdict.json --controlled-modes 2 --damping 0.05 --to controller.c
     """
     import numpy as np
 

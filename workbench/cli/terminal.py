@@ -24,7 +24,7 @@ OPTIONS = {  # by argument, or by its words in a message, a regular expression
     "n_modes": "--modes",
     "band_hz": "--band-hz",
     r"input_hold(?= is zero \(held\))": "--input-hold",  # not the key of a case file
-    "(?<=raise )the limit of effort": "--effort",
+    "(?<=raise )the limit of effort": "--effort-ratio",
     "the limit of peak force": "--peak-force",
     "the limit of condition": "--condition",
     "(?<=lower )the spacing": "--spacing",

@@ -57,7 +57,7 @@ def read_record(
         path: of a .csv, .txt, .asc, .dat, .tsv, .npz, .mat, .h5, .hdf5, .uff, .unv, .tdms or .wav file.
         sample_rate_hz: where the file itself has no time.
         inputs: names of the input signals, where the file does not say.
-        input_hold: "zero", "first" or "band-limited", the course of inputs between samples; by default as the file
+        input_hold: "zero", "first" or "band-limited", the intersample behaviour; by default as the file
             says, else "zero". Files of other programs do not say.
         limits: of memory and processor time, `records.limits.ReadLimits`: 1 GiB and 10 s by default.
         units: of the signals, such as those of a case; numbers without a stated unit are not converted.

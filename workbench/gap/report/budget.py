@@ -178,8 +178,8 @@ class Budget:
             return None
         if ratio > AT_BOUND * JOINT.credible:
             return (
-                f"The residual is {ratio:.2g} times the model's noise_std or more: more noise than stated, or errors of the model"
-                " that neither effects nor small errors describe."
+                f"The residual is {ratio:.2g} times the model's noise_std or more: more noise than stated, or errors of"
+                " the model that neither effects nor small errors describe."
             )
         if self.leaves_more_than_noise:
             return f"What looks like noise is {ratio:.2g} times the model's noise_std; part of it may be of the model."
