@@ -187,7 +187,7 @@ def test_a_verdict_prints_as_the_command_tells_it(hinged_rig, record_of):
     verdict = replace(verdict, notes=("A note.",))
     first, path, modes, *_, record, last = str(verdict).splitlines()
     assert first == verdict.sentence and last == "  A note."
-    assert path.startswith("  path       actuator") and modes.startswith("  modes      ")
+    assert path.startswith("  subsystem  actuator") and modes.startswith("  modes      ")
     told = re.fullmatch(r"  record 'check': rms error / rms signal (.*) % → [\d.]+ %, noise floor [\d.]+ %", record)
     read = records[1].outputs
     expected = 0.3 / 1.3 * np.sqrt(np.mean((read / read.std(axis=1, keepdims=True)) ** 2))

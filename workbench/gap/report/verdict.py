@@ -310,13 +310,13 @@ class Verdict:
         lines, where, gap = [self.sentence], self.where, self._gap
         if self.shows_gap:  # without a gap the residual is noise, and has no place
             amplitude = {True: "; depends on amplitude", False: "; does not depend on amplitude", None: ""}
-            lines.append(f"path       {where.path}{amplitude[where.amplitude_dependent]}")
+            lines.append(f"subsystem  {where.path}{amplitude[where.amplitude_dependent]}")
             lines.append(f"modes      {', '.join(map(str, where.modes)) or 'none'}")
         if self.shows_gap and where.path in ("structure", "environment") and self.location_in_words:
             lines.append(f"place      {self.location_in_words}")
         lines += [f"record {name!r}: {_gap_in_words(gap, name)}" for name in gap["before"]]
         if self.alternatives and self.outcome == "explained":
-            lines.append(f"named      probability {self.probability:.2g}, against")
+            lines.append(f"probability {self.probability:.2g} of the set named")
         alternatives = self.alternatives_in_words[:ALTERNATIVES]
         lines += [f"alternative {words} ({probability:.2g})" for words, probability in alternatives]
         return "\n  ".join([*lines, *self.notes])
