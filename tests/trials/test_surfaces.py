@@ -19,7 +19,7 @@ from workbench.structure.member import Beam
 from workbench.structure.plate import Plate
 from workbench.trials.benches import Scene, draw_bench, experiments
 from workbench.trials.finite_elements import Alterations, element_modes, matrix_modes
-from workbench.trials.hidden import stands
+from workbench.trials.hidden import place_of
 from workbench.trials.hold import NOT_ON, draw_kinds, hold_trials
 from workbench.trials.make import KINDS, make_trial
 from workbench.trials.plane_frame import Section, plane_frame
@@ -163,7 +163,7 @@ def _effect(told: dict, domain) -> Effect:
         target = (target, told.get("with", told.get("from")))
     if told["kind"] == "truncated_modes":
         target, values = values["needed"], {}
-    place = stands(told)
+    place = place_of(told)
     return Effect(kind_named(told["kind"]), target, {**(place_values(place) if place else {}), **values})
 
 

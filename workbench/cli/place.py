@@ -37,12 +37,9 @@ def place(
     ],
     weight: options.Weight = 1.0,
     impulse_at: options.ImpulseAt = None,
-    effort: Annotated[
+    effort_ratio: Annotated[
         float,
-        typer.Option(
-            "--effort-ratio",
-            help="Effort limit, as a multiple of that of even places (beam) or of the rig's own actuators.",
-        ),
+        typer.Option(help="Effort limit, as a multiple of that of even places (beam) or of the rig's own actuators."),
     ] = 1.5,
     spacing: Annotated[
         float | None,
@@ -88,9 +85,9 @@ def place(
     from workbench.rig.actuators import command_unit
 
     check_target(json_path, picture, figure=picture)
-    if not effort > 0:
+    if not effort_ratio > 0:
         raise ValueError(
-            f"--effort-ratio is a multiple, above 0, of the effort at even places or the rig's own; got {effort:g}"
+            f"--effort-ratio is a multiple, above 0, of the effort at even places or the rig's; got {effort_ratio:g}"
         )
     if spacing is not None and not 0 <= spacing < math.inf:
         raise ValueError(f"--spacing must be 0 or more; got {spacing:g}")
@@ -111,7 +108,7 @@ def place(
         reference = _reference(task, found)
         least = 0.0 if isinstance(domain, NamedPoints) else max(LEAST_SPACING * domain.size, extent(task.actuator))
         limits = Limits(
-            effort=effort * reference.effort,
+            effort=effort_ratio * reference.effort,
             spacing=least if spacing is None else spacing,
             peak_force=peak_force,
             condition=condition,
