@@ -12,7 +12,7 @@ from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.where import of_one_sensor
 from workbench.gap.prediction.noise import is_noise_alone, noise_found
 from workbench.gap.search.beside_random import decide_on_random, random_with_effects, random_with_nominal_errors
-from workbench.gap.search.errors_as_effects import NO_UNIFORM_ERROR, are_uniform_errors, is_plausible_error
+from workbench.gap.search.errors_as_effects import NO_UNIFORM_ERROR, UNIFORM, are_uniform_errors, is_plausible_error
 from workbench.gap.search.finish import finished, ranked, relocated, simplest
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
@@ -133,9 +133,7 @@ class Stages:
         if not (self.ahead and pairs.with_a_third_ahead(self.ahead[0].cost)):
             return None
         decision = pairs.decision(self.start)
-        effects = decision.best.effects
-        uniform = {effect.kind for effect in NO_UNIFORM_ERROR}
-        if any(effect.kind in uniform or is_plausible_error(effect, search) for effect in effects):
+        if any(effect.kind in UNIFORM or is_plausible_error(effect, search) for effect in decision.best.effects):
             return None
         return self._if_significant(decision)
 
