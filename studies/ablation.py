@@ -56,7 +56,8 @@ def trial(case: Path, label: dict, group: str, name: str, factor: float) -> dict
     found = score(verdict, label, domain=rig.modes.domain, **parts)
     right = found["kinds"] and found["channels"] is not False and found["positions"] is not False
     named = [
-        " of ".join([e["kind"], *(e[port] for port in ("input", "output") if port in e)]) for e in verdict["effects"]
+        " of ".join([e["kind"], *(e[transducer] for transducer in ("input", "output") if transducer in e)])
+        for e in verdict["effects"]
     ]
     said = f"{verdict['outcome']}: {' + '.join(sorted(named)) or 'no effect'}"
     return {"verdict": said if right else f"{said} (wrong)"}

@@ -19,7 +19,7 @@ from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
-from workbench.rig.simulate import predict
+from workbench.rig.simulate import simulate_record
 from workbench.robust.plain_law import plain_law
 from workbench.robust.redesign import redesign
 from workbench.structure.damping import ModalDamping
@@ -73,7 +73,7 @@ def believed(record):
 
 def left(rig, record):
     """What a rig leaves of a record: (n_samples,) encoder counts."""
-    return (record.outputs - predict(rig, record))[0]
+    return (record.outputs - simulate_record(rig, record))[0]
 
 
 def identified(records, start, at=None):
@@ -216,7 +216,7 @@ def _plot_responses(before, after, rig, corrected):
     for ax, record, models in ((axes[0], before, (first,)), (axes[1], after, (first, second))):
         ax.loglog(*_response(record, record.outputs), color=COLOURS[6], linewidth=3.0, alpha=0.4, label="measured")
         for model, label, colour, style in models:
-            outputs = predict(model, record)
+            outputs = simulate_record(model, record)
             label = "the rig of the first test" if record is after and model is rig else label
             ax.loglog(*_response(record, outputs), color=colour, linestyle=style, label=label)
         ax.set(title=f"{record.name} the change", xlabel="frequency [Hz]")

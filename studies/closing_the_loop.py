@@ -15,7 +15,7 @@ from workbench.gap.prediction.noise import noise_found
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.search.fit import fit
 from workbench.gap.search.intervals import with_intervals
-from workbench.rig.simulate import predict
+from workbench.rig.simulate import simulate_record
 from workbench.robust.impulse import impulse_test
 from workbench.robust.plain_law import plain_law
 from workbench.robust.posterior import UncertainRig
@@ -143,7 +143,9 @@ def _fitted(case, true):
     data = FitData(case.fit, np.array([s.noise_std for s in rig.sensors]), substeps=8)
     fits = [fit(rig, [_beside(e, rig, off) for e in true], data, iterations=15) for off in OFF]
     found = min(fits, key=lambda one: one.cost)
-    noise = noise_found([record.outputs - predict(apply_all(rig, found.effects), record) for record in case.fit])
+    noise = noise_found(
+        [record.outputs - simulate_record(apply_all(rig, found.effects), record) for record in case.fit]
+    )
     if np.mean(found.cost_by_channel) > MORE * np.mean((noise / data.noise) ** 2):
         data = FitData(case.fit, noise, substeps=8)
         along = 0.02 if rig.structure is not None else 0.0

@@ -13,14 +13,14 @@ from workbench.draw.signals import plot_distortion
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect, apply_all
+from workbench.identification.frf import identify_frf
 from workbench.identification.rig_from import rig_from
 from workbench.identification.signal.distortion import distortion_of
-from workbench.identification.transfer import identify_transfer
 from workbench.records.record import Channel, Record
 from workbench.rig.force_laws import hysteresis
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
-from workbench.rig.simulate import predict
+from workbench.rig.simulate import simulate_record
 from workbench.structure.domain import Between
 from workbench.structure.modes import Modes, PointShapes
 
@@ -74,7 +74,7 @@ def identified(record: Record) -> Rig:
     lines = np.flatnonzero(strength > 0.05 * strength.max())
     transfer = (outputs / force)[:, :, lines].mean(axis=1)
     # what is left is no noise but distortion, at this level too: its size is left to the identification to find
-    found = identify_transfer(transfer, lines * RATE / PERIOD, channels=record.output_channels)
+    found = identify_frf(transfer, lines * RATE / PERIOD, channels=record.output_channels)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # complex modes, which the fit that follows makes real
         rig = rig_from(found, inputs=["excitation"], outputs=record.output_channels)
@@ -91,7 +91,7 @@ def left(rig: Rig, record: Record) -> np.ndarray:
     counted = slice(record.n_samples // 2, None)
     try:
         with np.errstate(over="ignore", invalid="ignore"):
-            error = record.outputs - predict(rig, record, substeps=SUBSTEPS)
+            error = record.outputs - simulate_record(rig, record, substeps=SUBSTEPS)
     except ValueError:
         return np.full(record.outputs[:, counted].shape, RUNAWAY)
     return np.clip(error[:, counted], -RUNAWAY, RUNAWAY)
@@ -196,7 +196,7 @@ def with_any_force(rig: Rig, where: Between, record: Record) -> np.ndarray:
 def lost_stiffness(rig: Rig, slip: Effect, record: Record) -> float:
     """Share of its stiffness that a slipping joint loses at the level of a record: 1 - rms z / rms w."""
     ends = tuple(Sensor(name, name, "displacement") for name in (slip.at.first, slip.at.second))
-    w = np.subtract(*predict(replace(slip.apply(rig), sensors=ends), record))
+    w = np.subtract(*simulate_record(replace(slip.apply(rig), sensors=ends), record))
     z = hysteresis(np.r_[0.0, w], slip.values["yield_displacement"])[1:]
     count = slice(record.n_samples // 2, None)
     return float(1.0 - z[count].std() / w[count].std())

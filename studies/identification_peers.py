@@ -34,9 +34,9 @@ from workbench.identification.free_decay.order import identify
 from workbench.identification.free_decay.refinement import cramer_rao_bound
 from workbench.identification.signal.projection import project
 from workbench.identification.signal.synthesis import free_decay
+from workbench.records.frequency_responses import read_frf
 from workbench.records.record import Record
 from workbench.records.resample import decimate
-from workbench.records.transfer_functions import read_transfer
 from workbench.structure.modes import SampledModes
 
 STRUCTURES, FIRST_SEED = 50, 200  # settings were chosen on seeds below 110
@@ -251,7 +251,7 @@ def study(outcome, data: Path | None = None) -> None:
 
 def on_the_ruler(outcome, methods: dict, data: Path) -> None:
     """No truth but the eight modes known of it; what each method leaves of the record, amplitudes fitted alike."""
-    record = read_transfer(data, positions=RULER_POSITIONS, quantity="acceleration")
+    record = read_frf(data, positions=RULER_POSITIONS, quantity="acceleration")
     record = decimate(record, RULER_DECIMATION)
     rows = {}
     for name, method in methods.items():

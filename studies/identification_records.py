@@ -21,8 +21,8 @@ from workbench.identification.ambient import identify_ambient
 from workbench.identification.driven import identify_driven
 from workbench.identification.free_decay.assumptions import amplitude_dependence
 from workbench.identification.free_decay.order import identify
+from workbench.identification.frf import identify_frf
 from workbench.identification.ring_down import ring_down
-from workbench.identification.transfer import identify_transfer
 from workbench.records.record import Channel, Record
 from workbench.structure.member import Beam
 
@@ -182,7 +182,7 @@ def transfer_functions(structure: Structure):
     std = LEVEL * np.sqrt((clean**2).mean(axis=1, keepdims=True))
     real, imaginary = np.split(clean + std * structure.rng.standard_normal(clean.shape), 2, axis=1)
     noise = np.broadcast_to(std, real.shape)
-    found = identify_transfer(real + 1j * imaginary, LINES, channels=channels(ACCELERATIONS), noise_std=noise)
+    found = identify_frf(real + 1j * imaginary, LINES, channels=channels(ACCELERATIONS), noise_std=noise)
     return found, bound(answer, truth, std)
 
 

@@ -239,26 +239,26 @@ def plot_designs(rows, figures, title):
 
 def plot_switching(law, switched):
     """The first controlled mode under on-off control: its path in the phase plane, and the force over time."""
-    relay, stretches = law.relays[0], switched.stretches[0]
+    relay, segments = law.relays[0], switched.segments[0]
     response, r = switched.response, law.controlled[0]
     q, v = response.modal[r], response.modal[response.modes.n_modes + r]
     figure, axes = new_figure(1, 2, width=11, height=4.5)
     axes[0].plot(q, v, color=COLOURS[0], linewidth=1.0, label="motion")
-    for stretch in stretches:
-        if stretch.sliding:
-            inside = (response.time >= stretch.start) & (response.time <= stretch.end)
+    for segment in segments:
+        if segment.sliding:
+            inside = (response.time >= segment.start) & (response.time <= segment.end)
             axes[0].plot(q[inside], v[inside], color=COLOURS[1], linewidth=3.5, label="sliding mode")
     reach = np.array([q.min(), q.max()])
     edges = [edge - relay.slope * reach for edge in (-relay.dead_band, relay.dead_band)]
     axes[0].fill_between(reach, *edges, color=GREY, alpha=0.25, label="dead band: no force")
-    switches = np.array([(s.displacement, s.rate) for s in stretches[1:]]).reshape(-1, 2)
+    switches = np.array([(s.displacement, s.rate) for s in segments[1:]]).reshape(-1, 2)
     axes[0].plot(*switches.T, ".", color=COLOURS[6], markersize=5, label="switches")
     handles, labels = axes[0].get_legend_handles_labels()
     once = dict(zip(labels, handles, strict=True))
     axes[0].legend(once.values(), once.keys(), loc="lower left")
     axes[0].set(xlabel=f"q{r + 1} [m √kg]", ylabel=f"dq{r + 1}/dt [m √kg/s]", title=f"mode {r + 1} in the phase plane")
     pushes = np.zeros(response.time.size)
-    for s in stretches:
+    for s in segments:
         tau = response.time - s.start
         inside = (tau >= 0) & (response.time <= s.end)
         pushes[inside] = s.steady + s.ramp * tau[inside] + s.fading * np.exp(-relay.slope * tau[inside])

@@ -21,8 +21,8 @@ from workbench.identification.free_decay.ibrahim import stabilise, stable_modes
 from workbench.identification.free_decay.refinement import modal_amplitudes
 from workbench.identification.shapes.eigenfunctions import BoundaryConditions, eigenfunctions
 from workbench.identification.shapes.mode_pairing import pair_modes
+from workbench.records.frequency_responses import read_frf
 from workbench.records.resample import decimate
-from workbench.records.transfer_functions import read_transfer
 from workbench.rig.rig import Rig
 from workbench.structure.member import Beam
 
@@ -102,7 +102,7 @@ def placement_on_shapes(modes, placements, *, n_controlled):
 
 
 def study(outcome, data: Path | None = None) -> None:
-    record = decimate(read_transfer(data, positions=POSITIONS, quantity="acceleration"), DECIMATION)
+    record = decimate(read_frf(data, positions=POSITIONS, quantity="acceleration"), DECIMATION)
     diagram = stabilise(record, orders=ORDERS, delays=DELAYS)
     stayed = modal_amplitudes(record, stable_modes(diagram).modes)
     stayed = stayed.select(np.flatnonzero(stayed.frequencies_hz < BAND_HZ))

@@ -21,7 +21,7 @@ NEEDS_DATA = "SNLS80mV.mat of the Silverbox benchmark"
 SAMPLE_TIME = 2**14 / 1e7
 ARROW = slice(0, 40000)
 FIRST, PERIOD = 40560, 8692  # the ten multisines with the zeros before them
-SETTLE = 1.0  # s; a multisine starts while the one before still rings
+TRANSIENT = 1.0  # s; a multisine starts while the one before still rings
 RESOLUTION = 0.4e-3  # V: what a model of an electronic circuit is asked to explain
 
 
@@ -43,7 +43,7 @@ def linear_rig(omega, zeta, stiffness):
 
 def best_linear(record):
     """The linear model of least squared error on a record."""
-    lead = round(SETTLE / SAMPLE_TIME)
+    lead = round(TRANSIENT / SAMPLE_TIME)
 
     def residual(p):
         rig = linear_rig(*np.exp(p))
@@ -53,8 +53,8 @@ def best_linear(record):
     return linear_rig(*np.exp(least_squares(residual, start, x_scale=0.01).x))
 
 
-def rmse(rig, record, settle):
-    lead = round(settle / SAMPLE_TIME)
+def rmse(rig, record, transient):
+    lead = round(transient / SAMPLE_TIME)
     error = record.outputs - simulate(rig, record.inputs, sample_time=SAMPLE_TIME).outputs
     return float(np.sqrt(np.mean(error[0, lead:] ** 2)))
 
@@ -74,7 +74,7 @@ def study(outcome, data: Path) -> None:
             name=name,
         )
 
-    lead = round(SETTLE / SAMPLE_TIME)
+    lead = round(TRANSIENT / SAMPLE_TIME)
     fitted = record("multisines 1-5", slice(FIRST, FIRST + 5 * PERIOD))
     held_out = record("multisines 6-10", slice(FIRST + 5 * PERIOD - lead, FIRST + 10 * PERIOD))
     arrow = record("arrow", ARROW)
@@ -85,13 +85,13 @@ def study(outcome, data: Path) -> None:
         (fitted,),
         validation=(held_out,),
         name="silverbox",
-        settle=SETTLE,
+        transient=TRANSIENT,
         uncertain_nominal=True,
         units=Units(length="V", mass="s^2", time="s", force="V"),  # of a circuit
     )
     errors = {
-        name: {"before": rmse(nominal, r, settle), "after": rmse(verdict.corrected, r, settle)}
-        for name, r, settle in (("multisines", held_out, SETTLE), ("arrow", arrow, 0.0))
+        name: {"before": rmse(nominal, r, transient), "after": rmse(verdict.corrected, r, transient)}
+        for name, r, transient in (("multisines", held_out, TRANSIENT), ("arrow", arrow, 0.0))
     }
     outcome.say(verdict.sentence)
     for name, error in errors.items():

@@ -114,7 +114,7 @@ def study(outcome, data=None):
     ways = {"Luenberger observer": observed, "Kalman filter": estimated, "modal filter": through_filter}
     counts, margins = {}, {}
     for name, way in ways.items():
-        counts[name], margins[name] = sufficient_sensors(modes, way, one, most=24)
+        counts[name], margins[name] = sufficient_sensors(modes, way, one, max_sensors=24)
         outcome.say(f"{name}: {counts[name] or 'no number up to 24 of'} evenly spaced sensors suffice")
     outcome.say(
         "an even grid of k sensors takes mode 2(k + 1) - r for mode r, so a filter of displacements alone is cured only"

@@ -161,7 +161,7 @@ def test_the_decay_rate_was_called_margin():
         spillover_remedies(MODES, lambda *_: controller, LAW.actuators, [3.0], margin=-1e9)
 
 
-@pytest.mark.parametrize("port", [Actuator("F1", 2.0, delay=0.1), Sensor("d", 1.0)])
-def test_whether_a_port_has_a_state_space_was_called_linear(port):
+@pytest.mark.parametrize("transducer", [Actuator("F1", 2.0, delay=0.1), Sensor("d", 1.0)])
+def test_whether_a_transducer_has_a_state_space_was_called_linear(transducer):
     with pytest.warns(DeprecationWarning, match="linear is now has_state_space"):
-        assert port.linear is port.has_state_space
+        assert transducer.linear is transducer.has_state_space

@@ -32,10 +32,10 @@ from .gap.report.verdict import Verdict as Verdict
 from .identification.ambient import identify_ambient as identify_ambient
 from .identification.driven import identify_driven as identify_driven
 from .identification.free_decay.order import identify as identify
+from .identification.frf import identify_frf as identify_frf
 from .identification.rig_from import rig_from as rig_from
 from .identification.ring_down import ring_down as ring_down
 from .identification.shapes.eigenfunctions import eigenfunctions as eigenfunctions
-from .identification.transfer import identify_transfer as identify_transfer
 from .identification.updating.distributions import mass_and_stiffness as mass_and_stiffness
 from .identification.updating.local_loss import locate_damage as locate_damage
 from .identification.updating.structure_fit import choose_structure as choose_structure
@@ -43,10 +43,10 @@ from .identification.updating.structure_fit import fit_structure as fit_structur
 from .records.files import read_measured as read_measured
 from .records.files import read_record as read_record
 from .records.files import write_record as write_record
+from .records.frequency_responses import FrequencyResponses as FrequencyResponses
 from .records.modes_file import read_modes as read_modes
 from .records.record import Channel as Channel
 from .records.record import Record as Record
-from .records.transfer_functions import TransferFunctions as TransferFunctions
 from .rig.actuators import Actuator as Actuator
 from .rig.actuators import piezo_patch as piezo_patch
 from .rig.elements import UserLaw as UserLaw

@@ -21,7 +21,7 @@ from workbench.structure.modes import Modes, PointShapes
 from workbench.structure.plate import Plate
 from workbench.structure.supports import Edge
 
-PORTS = """
+TRANSDUCERS = """
 [[input]]
 name = "F1"
 kind = "actuator"
@@ -48,13 +48,13 @@ poisson_ratio = 0.3
 edges = {left = "simply supported", right = "simply supported", bottom = "simply supported", top = "simply supported"}
 damping_ratio = 0.01
 modes = 4
-""" + PORTS.format("at = [0.3, 0.2]", "at = [0.5, 0.4]")
+""" + TRANSDUCERS.format("at = [0.3, 0.2]", "at = [0.5, 0.4]")
 FRAME = """[structure]
 kind = "modal"
 natural_frequencies_hz = [3.0, 7.0]
 damping_ratios = [0.01, 0.02]
 points = "points.csv"
-""" + PORTS.format('point = "a.x"', 'point = "b.y"')
+""" + TRANSDUCERS.format('point = "a.x"', 'point = "b.y"')
 POINTS = """name,node,x,y,z,direction,mode_1,mode_2
 a.x,1,0,0,0,x,0.5,0.25
 a.y,1,0,0,0,y,-0.5,0.75
@@ -94,7 +94,7 @@ def test_moments_and_slopes_of_a_plate_have_an_axis(tmp_path):
     # the first mode is a multiple of sin(π x / 1.2) sin(π y / 0.9): -∂w/∂x about y, ∂w/∂y about x
     kx, ky = np.pi / 1.2, np.pi / 0.9
     first = rig.modes.phi((0.3, 0.2))[0, 0] / (np.sin(0.3 * kx) * np.sin(0.2 * ky))
-    into, out = (shape_of(rig.modes, port)[0] for port in (*rig.actuators, *rig.sensors))
+    into, out = (shape_of(rig.modes, transducer)[0] for transducer in (*rig.actuators, *rig.sensors))
     assert into == pytest.approx(-first * kx * np.cos(0.3 * kx) * np.sin(0.2 * ky))
     assert out == pytest.approx(first * ky * np.sin(0.5 * kx) * np.cos(0.4 * ky))
 
@@ -131,8 +131,8 @@ def test_moments_slopes_and_directions_are_written_as_they_were(tmp_path):
 
     points = NamedPoints(("p", "q"), np.eye(3)[:2], ("x", "rz"), ("n", "n"))
     modes = Modes([20.0, 31.0], [0.01, 0.01], PointShapes([[1.0, 2.0], [3.0, 4.0]]), points)
-    ports = (Actuator("M", "p", "moment", direction="z"), Actuator("F", "q", direction="x"))
-    frame = Rig(modes, ports, (Sensor("s", "q", "slope", noise_std=0.01),))
+    transducers = (Actuator("M", "p", "moment", direction="z"), Actuator("F", "q", direction="x"))
+    frame = Rig(modes, transducers, (Sensor("s", "q", "slope", noise_std=0.01),))
     read = again(frame, tmp_path / "frame")
     assert read.actuators == frame.actuators and read.sensors == frame.sensors
 

@@ -139,7 +139,7 @@ def test_identify_takes_inputs_that_run_straight(tmp_path):
     assert refused.exit_code == 2 and "--input-hold is zero (held), first" in " ".join(refused.output.split())
 
 
-def test_identify_reads_transfer_functions(tmp_path):
+def test_identify_reads_frfs(tmp_path):
     lines, omega, zeta = np.linspace(1.0, 30.0, 400), 2.0 * np.pi * np.array([8.0, 19.0]), 0.01
     s = 2j * np.pi * lines
     shapes = np.array([[1.0, 0.6], [0.5, -1.0], [-0.2, 0.3]])
@@ -148,7 +148,7 @@ def test_identify_reads_transfer_functions(tmp_path):
     path, found = tmp_path / "frf.npz", tmp_path / "found.json"
     np.savez(path, frequency_hz=lines, H=h + 0.02 * (noise[0] + 1j * noise[1]))
     result = run("identify", path, "--json", found)
-    assert result.exit_code == 0 and "transfer functions of 3 outputs and 1 input, 400 lines" in result.output
+    assert result.exit_code == 0 and "FRFs of 3 outputs and 1 input, 400 lines" in result.output
     modes = json.loads(found.read_text())
     scores = (np.array(modes["frequencies_hz"]) - [8.0, 19.0]) / modes["frequencies_std_hz"]
     assert np.abs(scores).max() < 4.0 and modes["sensors"] == ["H 1", "H 2", "H 3"]

@@ -67,7 +67,7 @@ def test_a_former_name_of_an_option_is_taken_for_the_new_one(run):
 
 
 def test_what_was_corrected_is_stated_in_the_verdict_and_on_the_page(run, tmp_path):
-    """Two outputs of records that begin in motion are exchanged; with --settle that is seen and corrected too."""
+    """Two outputs of records that begin in motion are exchanged; with --transient that is seen and corrected too."""
     beam = Beam(
         length=2.0, mass_per_length=1.0, bending_stiffness=20.0, left="hinged", right="hinged",
         damping=ModalDamping(0.3),
@@ -81,7 +81,7 @@ def test_what_was_corrected_is_stated_in_the_verdict_and_on_the_page(run, tmp_pa
         records.append(replace(clean, outputs=outputs[::-1], start_time=0.0))
     write_case(Case("crossed", rig, (records[0],), (records[1],)), tmp_path / "crossed")
     verdict, page = tmp_path / "v.json", tmp_path / "p.html"
-    options = ("--settle", "6", "--workers", "1", "--json", verdict, "--page", page)
+    options = ("--transient", "6", "--workers", "1", "--json", verdict, "--page", page)
     assert "The outputs y1 and y2 are exchanged" in run("diagnose", tmp_path / "crossed", *options).output
     assert not page.exists()
     told = run("diagnose", tmp_path / "crossed", *options, "--correct")
@@ -134,7 +134,7 @@ def test_a_nominal_model_is_learnt_from_a_record_at_low_level(run, tmp_path, mon
 
     def search(rig, records, **options):
         seen.extend([rig, *records])
-        settled.append(options["settle"])
+        settled.append(options["transient"])
         raise ValueError("the search has begun")
 
     monkeypatch.setattr("workbench.gap.diagnose_case.diagnose", search)
@@ -158,7 +158,7 @@ def test_a_nominal_model_is_learnt_from_a_record_at_low_level(run, tmp_path, mon
     assert "INPUT,OUTPUT" in run("diagnose", *options, "F1").output
     assert "driving_point is (input, output)" in run("diagnose", *options, "F1,nowhere").output
     assert "the search has begun" in run("diagnose", *options, f"F1,{real.rig.sensors[0].name}").output
-    options = (*options, f"F1,{real.rig.sensors[0].name}", "--settle", "0.5")
+    options = (*options, f"F1,{real.rig.sensors[0].name}", "--transient", "0.5")
     assert "the search has begun" in run("diagnose", *options).output and settled == [0.0, 0.0, 0.5]
     days = [tmp_path / day / "sweep.csv" for day in ("monday", "tuesday")]
     for file in days:

@@ -123,7 +123,7 @@ def test_the_pages_of_a_record_of_two_inputs_show_the_responses_to_each_or_say_w
 
 
 @pytest.mark.slow
-def test_the_page_of_transfer_functions_shows_the_band_that_was_fitted(run, tmp_path):
+def test_the_page_of_frfs_shows_the_band_that_was_fitted(run, tmp_path):
     from scipy.io import savemat
 
     lines, page = np.linspace(0.0, 100.0, 2001), tmp_path / "p.html"

@@ -133,13 +133,13 @@ def test_units_stand_in_the_table_as_they_are_written(run, tmp_path):
     assert "a        acceleration [m/s^2]" in seen
 
 
-def test_transfer_functions_are_shown(run, tmp_path):
+def test_frfs_are_shown(run, tmp_path):
     lines = np.linspace(1.0, 100.0, 400)
     h = 1.0 / (OMEGA**2 - (2.0 * np.pi * lines) ** 2 + 2j * ZETA * OMEGA * 2.0 * np.pi * lines)
     np.savez(tmp_path / "frf.npz", frequency_hz=lines, H=h)
     seen = run("look", tmp_path / "frf.npz", "--page", tmp_path / "p.html")
     assert seen.exit_code == 0, seen.output
-    assert "transfer functions of 1 output and 1 input, 400 lines from 1 to 100 Hz" in seen.output
+    assert "FRFs of 1 output and 1 input, 400 lines from 1 to 100 Hz" in seen.output
     [row] = [line.split() for line in seen.output.splitlines() if line.startswith("H")]
     assert abs(float(row[-1]) - 40.0) < 0.3
 

@@ -5,10 +5,10 @@ import pytest
 from scipy.signal import lfilter, welch
 
 from workbench.draw.plot import plot
-from workbench.draw.signals import plot_frf, plot_frf_of_inputs, plot_transfer, power_spectrum
+from workbench.draw.signals import plot_frf, plot_frf_matrix, plot_frf_of_inputs, power_spectrum
 from workbench.identification.signal.frequency_responses import frequency_responses
+from workbench.records.frequency_responses import FrequencyResponses
 from workbench.records.record import Channel, Record
-from workbench.records.transfer_functions import TransferFunctions
 
 
 def test_the_frequency_response_is_that_of_the_filter_between_input_and_output():
@@ -33,13 +33,13 @@ def test_lines_of_the_same_colour_differ_by_their_dashes():
         assert len({(line.get_color(), line.get_linestyle()) for line in ax.lines}) == 9
 
 
-def test_transfer_functions_are_drawn_by_magnitude_and_phase_with_what_was_fitted():
+def test_frfs_are_drawn_by_magnitude_and_phase_with_what_was_fitted():
     """Of one mode: 1 / c ω in size and -90° at its frequency."""
     lines, omega, zeta = np.linspace(1.0, 40.0, 391), 2.0 * np.pi * 20.0, 0.02
     h = 1.0 / (omega**2 - (2.0 * np.pi * lines) ** 2 + 4j * np.pi * zeta * omega * lines)
-    measured = TransferFunctions(h[None, None], lines, (Channel("y", "displacement", "m"),))
-    fitted = TransferFunctions(2.0 * h[None, None, 90:], lines[90:], measured.output_channels)
-    for figure in (plot(measured), plot_transfer(measured, fitted)):
+    measured = FrequencyResponses(h[None, None], lines, (Channel("y", "displacement", "m"),))
+    fitted = FrequencyResponses(2.0 * h[None, None, 90:], lines[90:], measured.output_channels)
+    for figure in (plot(measured), plot_frf_matrix(measured, fitted)):
         magnitude, phase = figure.axes
         assert magnitude.get_yscale() == "log" and phase.get_xlabel() == "frequency [Hz]"
         assert magnitude.get_ylabel() == "|y|\n[m per input]"
@@ -67,7 +67,7 @@ def test_responses_to_several_inputs_have_a_panel_per_output_and_a_line_per_inpu
     channels = tuple(Channel(f"y{j}", "acceleration") for j in range(3))
     found = frequency_responses([Record(0.01, gains @ u, channels, u, (Channel("F", "force"), Channel("G", "force")))])
     lines = np.linspace(0.1, 49.0, 200)
-    fitted = TransferFunctions(np.repeat(gains[..., None], 200, axis=2), lines, channels, ("F", "G"))
+    fitted = FrequencyResponses(np.repeat(gains[..., None], 200, axis=2), lines, channels, ("F", "G"))
     *panels, coherence = plot_frf_of_inputs(found, fitted).axes
     assert len(panels) == 3 and panels[0].get_ylabel() == "|y0 / input|\n[(m/s²)/N]"
     for panel, row in zip(panels, np.abs(gains), strict=True):

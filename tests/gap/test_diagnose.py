@@ -150,7 +150,9 @@ def test_an_effect_of_the_users_own_joins_the_catalogue():
             Parameter("stiffness", "N/m^2", 1e-9, 1e9, logarithmic=True),
         ),
         apply=lambda rig, _, v: with_element(rig, UserLaw(v["at"], quadratic, (v["stiffness"],))),
-        starts=lambda evidence, _: [{"at": p.at, "stiffness": k} for p in evidence.at_peaks for k in (0.01, 0.1, 1.0)],
+        starts=lambda reconstruction, _: [
+            {"at": p.at, "stiffness": k} for p in reconstruction.at_peaks for k in (0.01, 0.1, 1.0)
+        ],
     )
     case, _ = make_trial(13)
     true = Effect(mine, None, {"at": 0.37 * case.rig.modes.length, "stiffness": 0.2})
@@ -309,10 +311,10 @@ def test_wires_that_are_surely_exchanged_are_put_right_before_the_search(hinged_
     assert exchange.kind not in {e.kind for e in without.effects}
 
 
-@pytest.mark.parametrize("settle", [-1.0, 1e6, np.nan])
-def test_a_time_to_settle_that_no_record_has_is_refused(nothing_hidden, settle):
-    with pytest.raises(ValueError, match="settle must be 0 or more and less than the shortest record"):
-        diagnose(nothing_hidden.rig, nothing_hidden.fit, settle=settle, workers=1)
+@pytest.mark.parametrize("transient", [-1.0, 1e6, np.nan])
+def test_a_time_to_settle_that_no_record_has_is_refused(nothing_hidden, transient):
+    with pytest.raises(ValueError, match="transient must be 0 or more and less than the shortest record"):
+        diagnose(nothing_hidden.rig, nothing_hidden.fit, transient=transient, workers=1)
 
 
 @pytest.mark.parametrize(

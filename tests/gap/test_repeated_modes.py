@@ -7,8 +7,8 @@ import pytest
 
 from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import kind_named
-from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.force_location import locate_force
+from workbench.gap.localisation.force_reconstruction import ForceReconstruction
 from workbench.gap.prediction.residuals import FitData
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
@@ -47,7 +47,7 @@ def test_prediction_and_place_of_the_force_do_not_depend_on_the_basis(square_pla
     np.testing.assert_allclose(turned, left, atol=1e-9 * np.abs(left).max())
     corrected, turned = (data.residual(kind_named("cubic_spring").apply(rig, None, SPRING)) for rig in rigs)
     np.testing.assert_allclose(turned, corrected, atol=1e-6)
-    places = [locate_force(Evidence.of(rig, data)) for rig in rigs]
+    places = [locate_force(ForceReconstruction.of(rig, data)) for rig in rigs]
     assert places[1].at == pytest.approx(places[0].at, abs=1e-5)
     assert places[0].at == pytest.approx((SPRING["x"], SPRING["y"]), abs=0.02)
     assert places[1].at_std == pytest.approx(places[0].at_std, rel=1e-2)

@@ -275,8 +275,10 @@ def make(folder, rng, wrongs):
 def check_told(case, folder):
     """An accepted case has the channels, modes and records that tomllib finds in its file; written again, the same."""
     table = tomllib.loads((folder / "case.toml").read_text())
-    ports = [*table["input"], *table["output"]]
-    assert [port.name for port in (*case.rig.actuators, *case.rig.sensors)] == [port["name"] for port in ports]
+    transducers = [*table["input"], *table["output"]]
+    assert [transducer.name for transducer in (*case.rig.actuators, *case.rig.sensors)] == [
+        transducer["name"] for transducer in transducers
+    ]
     structure, omega = table["structure"], case.rig.modes.omega
     n_modes = structure.get("modes", len(structure.get("natural_frequencies_hz", [1])))
     assert omega.shape == (n_modes,) and np.isfinite(omega).all() and np.isfinite(case.rig.modes.damping).all()
@@ -286,8 +288,11 @@ def check_told(case, folder):
     again = read_case(write_case(case, folder / "again").parent)
     np.testing.assert_allclose(again.rig.modes.omega, omega, rtol=1e-9)
     np.testing.assert_array_equal(again.fit[0].outputs, case.fit[0].outputs)
-    for ports in ("actuators", "sensors"):
-        moved = [[shape_of(rig.modes, port) for port in getattr(rig, ports)] for rig in (case.rig, again.rig)]
+    for transducers in ("actuators", "sensors"):
+        moved = [
+            [shape_of(rig.modes, transducer) for transducer in getattr(rig, transducers)]
+            for rig in (case.rig, again.rig)
+        ]
         np.testing.assert_allclose(*moved, rtol=1e-6, atol=1e-9)
 
 

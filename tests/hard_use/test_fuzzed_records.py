@@ -1,4 +1,4 @@
-"""Files made up from the grammar of each format, a record, transfer functions, or a refusal in one line.
+"""Files made up from the grammar of each format, a record, FRFs, or a refusal in one line.
 
 Case folders have theirs in `test_fuzzed_cases.py`: 300 inputs in all, 10,000 where slow tests are asked for.
 """
@@ -14,14 +14,14 @@ from nptdms import ChannelObject, GroupObject, RootObject, TdmsWriter
 from scipy.io import savemat
 
 from workbench.records.files import read_measured, write_record
+from workbench.records.frequency_responses import FrequencyResponses
 from workbench.records.limits import DEFAULT, RecordFileError, unreadable
 from workbench.records.record import Channel, Record
-from workbench.records.transfer_functions import TransferFunctions
 
 KINDS = (".csv", ".npz", ".mat", ".h5", ".uff", ".tdms", ".wav")
 READERS = ("mat_file", "hdf5_file", "uff_file", "tdms_file", "wav_file")  # each in a process of its own
 NAMES = ("t", "time", "Time (ms)", "a", "a [g]", "F (kN)", "acc real", "acc imag", "frequency [hz]", "f", "freq", "fs",
-         "omega", "positions", "transfer_header", "record_header", "record_channel_0", "npts", "b c", "x / mm",
+         "omega", "positions", "frf_header", "record_header", "record_channel_0", "npts", "b c", "x / mm",
          "µ", "1")  # fmt: skip
 CELLS = ("", "nan", "inf", "-", "1,5", "1.5", "1e999", "0x1", "1_0", '"', "abc", "12:00:00", "2024-05-01T12:00:00", "é",
          "[" * 50, "# x", "1 2", "-0", ".", "1e5", "٣")  # fmt: skip
@@ -280,7 +280,7 @@ def tried(path, rng: np.random.Generator, told: np.ndarray | None) -> bool:
         assert path.name in str(error) and len(str(error)) < 1000 and "\n" not in str(error)
         assert told is None, str(error)
         return False
-    assert isinstance(found, Record | TransferFunctions) and len(repr(found)) < 1000
+    assert isinstance(found, Record | FrequencyResponses) and len(repr(found)) < 1000
     assert not isinstance(found, Record) or (np.isfinite(found.outputs).all() and found.n_samples >= 2)
     if told is not None:
         np.testing.assert_array_equal(np.vstack([found.inputs, found.outputs]), told)
@@ -319,7 +319,7 @@ def test_many_files(tmp_path, here, ending):
 @pytest.mark.parametrize("header", HEADERS)
 def test_a_header_of_the_wrong_type_is_refused(tmp_path, header):
     path = tmp_path / "x.npz"
-    np.savez(path, f=np.arange(7.0), h=1j * np.ones((2, 7)), transfer_header=np.array(header))
+    np.savez(path, f=np.arange(7.0), h=1j * np.ones((2, 7)), frf_header=np.array(header))
     with pytest.raises(RecordFileError):
         read_measured(path)
     np.savez(path, t=np.arange(7.0), record_channel_0=np.ones(7), record_header=np.array(header))
@@ -327,7 +327,7 @@ def test_a_header_of_the_wrong_type_is_refused(tmp_path, header):
         read_measured(path)
 
 
-def test_places_of_transfer_functions_that_are_no_numbers_are_refused(tmp_path):
+def test_places_of_frfs_that_are_no_numbers_are_refused(tmp_path):
     path = tmp_path / "x.npz"
     np.savez(path, f=np.arange(7.0), h=1j * np.ones((1, 7)), at=np.array(["at the tip"]))
     with pytest.raises(RecordFileError, match="no numbers, 'at the tip'"):

@@ -8,13 +8,13 @@ from scipy.signal import butter, cont2discrete, dlsim, firwin, lfilter
 
 from workbench.identification.ambient import identify_ambient
 from workbench.identification.driven import identify_driven
+from workbench.identification.frf import identify_frf
 from workbench.identification.input_output.excitation import unexcited_remarks
 from workbench.identification.input_output.fit_errors import statistic_of_each
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import projected
 from workbench.identification.ring_down import ring_down
 from workbench.identification.signal.harmonics import harmonic_remarks
-from workbench.identification.transfer import identify_transfer
 from workbench.records.record import Channel, Record
 
 HZ, DAMPING = np.array([18.0, 72.0, 75.0, 160.0]), np.array([0.01, 0.005, 0.008, 0.01])
@@ -194,7 +194,7 @@ def test_noise_free_modes_do_not_depend_on_amplitude():
     assert not found.by_amplitude.depends.any()
 
 
-def transfer_functions(noise):
+def frfs(noise):
     lines = 0.5 * np.arange(1, 360)
     s, omega = 2j * np.pi * lines, 2.0 * np.pi * HZ
     each = np.array([s**2 / (w**2 + s**2 + 2.0 * z * w * s) for w, z in zip(omega, DAMPING, strict=True)])
@@ -205,11 +205,11 @@ def transfer_functions(noise):
 
 
 @pytest.mark.parametrize("outputs", [slice(None), slice(3, 4)])
-def test_transfer_functions_of_the_other_sign_are_turned_with_a_remark(outputs):
+def test_frfs_of_the_other_sign_are_turned_with_a_remark(outputs):
     """Of one output alone, no mode rose above the noise."""
-    h, lines, channels = transfer_functions(0.01)
+    h, lines, channels = frfs(0.01)
     h, channels = h[outputs], {"channels": channels["channels"][outputs]}
-    found, turned = (identify_transfer(values, lines, **channels) for values in (h, h.conj()))
+    found, turned = (identify_frf(values, lines, **channels) for values in (h, h.conj()))
     assert not found.remarks and "complex conjugates" in turned.remarks[0]
     np.testing.assert_allclose(turned.modes.frequencies_hz, found.modes.frequencies_hz, rtol=1e-12)
     np.testing.assert_allclose(found.modes.frequencies_hz, HZ, rtol=1e-3)
@@ -218,23 +218,23 @@ def test_transfer_functions_of_the_other_sign_are_turned_with_a_remark(outputs):
 
 @pytest.mark.parametrize("factor", [0.1, 1.0, 10.0])
 def test_noise_stated_ten_times_off_is_remarked(factor):
-    h, lines, channels = transfer_functions(0.01)
-    found = identify_transfer(h, lines, noise_std=0.01 * factor, **channels)
+    h, lines, channels = frfs(0.01)
+    found = identify_frf(h, lines, noise_std=0.01 * factor, **channels)
     said = [float(remark.split()[3]) for remark in found.remarks if "times noise_std" in remark]
     assert said == ([] if factor == 1.0 else [pytest.approx(1.0 / factor, rel=0.15)])
 
 
 def test_numbers_of_modes_below_one_are_refused():
-    h, lines, channels = transfer_functions(0.01)
+    h, lines, channels = frfs(0.01)
     spoilt = record(np.ones(200), np.random.default_rng(0).standard_normal((2, 200)), 100)
     with pytest.raises(ValueError, match="max_modes is a number of modes, 1 or more; got 0"):
-        identify_transfer(h, lines, max_modes=0, **channels)
+        identify_frf(h, lines, max_modes=0, **channels)
     with pytest.raises(ValueError, match="max_modes is"):
         identify_driven(spoilt, max_modes=0)
     with pytest.raises(ValueError, match="n_modes is a number of modes, 1 or more; got -1"):
         identify_ambient(spoilt, n_modes=-1)
-    with pytest.raises(ValueError, match="noise_std must have the shape of transfer"):
-        identify_transfer(h, lines, noise_std=np.ones(3), **channels)
+    with pytest.raises(ValueError, match="noise_std must have the shape of frf"):
+        identify_frf(h, lines, noise_std=np.ones(3), **channels)
 
 
 def test_a_repeated_root_is_remarked():
@@ -246,7 +246,7 @@ def test_a_repeated_root_is_remarked():
     h = np.einsum("jr,ir,rk->jik", shapes, shapes[:2], each)
     rng = np.random.default_rng(3)
     h = h + 1e-3 * np.abs(h).max() * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape))
-    found = identify_transfer(h, lines, channels=tuple(Channel(f"p{j}", "displacement", at=j / 3) for j in range(4)))
+    found = identify_frf(h, lines, channels=tuple(Channel(f"p{j}", "displacement", at=j / 3) for j in range(4)))
     np.testing.assert_allclose(found.modes.frequencies_hz, hz, rtol=1e-3)
     (remark,) = found.remarks
     assert remark.startswith("modes 1 and 2 (21 Hz) may be one repeated root")

@@ -10,11 +10,11 @@ import pytest
 from workbench.draw.plot import plot
 from workbench.identification.ambient import AmbientModes
 from workbench.identification.driven import identify_driven
+from workbench.identification.frf import identify_frf
 from workbench.identification.rig_from import rig_from
 from workbench.identification.ring_down import ring_down
 from workbench.identification.signal.clocks import CLOCKS, far_from_real
 from workbench.identification.signal.synthesis import free_decay
-from workbench.identification.transfer import identify_transfer
 from workbench.records.record import Channel
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
@@ -159,7 +159,7 @@ def test_rigid_motion_that_cannot_be_placed_is_said_to_be_left_out():
 
 @pytest.mark.parametrize("quantity", ["displacement", "velocity", "acceleration"])
 @pytest.mark.parametrize("dashpot", [0.0, 15.0])
-def test_transfer_functions_of_a_free_structure_keep_its_rigid_mode(quantity, dashpot):
+def test_frfs_of_a_free_structure_keep_its_rigid_mode(quantity, dashpot):
     """Two masses and a spring, held by nothing but a dashpot: φ = 1 / (m_1 + m_2)^½ of the rigid mode."""
     mass, stiffness = np.diag([1.0, 2.0]), 1e4 * np.array([[1.0, -1.0], [-1.0, 1.0]])
     hz, order = np.arange(4.0, 60.0, 0.1), MEASURED[quantity][1]
@@ -169,7 +169,7 @@ def test_transfer_functions_of_a_free_structure_keep_its_rigid_mode(quantity, da
     noise = np.random.default_rng(0).normal(size=(2, *h.shape))
     h = h + 1e-4 * np.abs(h).mean() * (noise[0] + 1j * noise[1])
     channels = (Channel("a", quantity), Channel("b", quantity))
-    found = identify_transfer(h, hz, channels=channels)
+    found = identify_frf(h, hz, channels=channels)
     with pytest.warns(UserWarning, match="is taken for rigid-body modes at 0 Hz"):
         rig = rig_from(found, inputs=["a"], outputs=channels)
     assert rig.modes.omega[0] == 0.0 and rig.modes.omega.size == 2
@@ -189,7 +189,7 @@ def test_modes_beyond_the_band_are_said_to_be_left_out_where_they_matter(lowest,
     noise = np.random.default_rng(0).normal(size=(2, *h.shape))
     h = h + 1e-3 * np.abs(h).mean(axis=1, keepdims=True) * (noise[0] + 1j * noise[1])
     channels = tuple(Channel(f"p{k}", "displacement") for k in range(4))
-    found = identify_transfer(h, hz, channels=channels)
+    found = identify_frf(h, hz, channels=channels)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         rig = rig_from(found, inputs=["p0"], outputs=channels)
@@ -301,7 +301,7 @@ def test_one_mode_of_two_set_ups_is_no_pair():
         h = np.concatenate([receptance(added, rows) for added, rows in set_ups])
         size = 3e-3 * np.sqrt((np.abs(h) ** 2).mean(axis=-1, keepdims=True))
         noise = np.random.default_rng(0).standard_normal((2, *h.shape))
-        return identify_transfer(h + size * (noise[0] + 1j * noise[1]), f, channels=channels)
+        return identify_frf(h + size * (noise[0] + 1j * noise[1]), f, channels=channels)
 
     bare, loaded = ([0.0] * 4, slice(2)), ([0.0, 0.0, 0.08, 0.05], slice(2, 4))
     force = [Channel("F", "force")]

@@ -10,8 +10,8 @@ import workbench as wb
 from workbench.identification.driven import _without_artefacts
 from workbench.identification.input_output import modal_fit, selection
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.model_order import Selected, SelectionOptions
-from workbench.identification.signal.modal_estimates import Identified, Refined, credible
+from workbench.identification.input_output.model_order import SelectedModes, SelectionOptions
+from workbench.identification.signal.modal_estimates import IdentifiedModes, RefinedModes, credible
 from workbench.identification.signal.searches import TimeLimit
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
@@ -88,11 +88,11 @@ def test_what_cannot_be_a_mode():
 
 def test_artefacts_join_the_noise():
     covariance = np.diag([1e-4, 900.0, 1e-6, 1e-6])
-    refined = Refined(
+    refined = RefinedModes(
         MODES, covariance**2, (np.ones((2, 2)),), np.zeros((2, 2, 1)), np.zeros((2, 2)), np.ones((1, 2)), True, 3
     )
     none = SampledModes(np.zeros(0), np.zeros(0), np.zeros((2, 0)), MODES.positions)
-    found = Identified(refined, np.array([90.0, 40.0]), 30.0, none, np.zeros(0)).without_artefacts(300.0)
+    found = IdentifiedModes(refined, np.array([90.0, 40.0]), 30.0, none, np.zeros(0)).without_artefacts(300.0)
     assert found.modes.omega.tolist() == [20.0] and found.noise_modes.omega.tolist() == [50.0]
     assert found.statistic.tolist() == [90.0] and found.noise_statistic.tolist() == [40.0]
     assert found.covariance.shape == (2, 2) and found.refined.amplitudes[0].shape == (2, 1)
@@ -103,7 +103,7 @@ def test_results_print_as_the_table_of_modes():
     head, *rows = str(found).splitlines()
     assert head.split() == ["mode", "frequency", "[Hz]", "±", "damping", "[%]", "±", "phase", "collinearity"]
     assert [float(row.split()[1]) for row in rows] == pytest.approx(found.modes.frequencies_hz, rel=1e-3)
-    assert repr(found) == "Identified(2 modes: 3.183, 7.958 Hz)" and found._repr_html_().count("<tr>") == 3
+    assert repr(found) == "IdentifiedModes(2 modes: 3.183, 7.958 Hz)" and found._repr_html_().count("<tr>") == 3
 
 
 def test_no_fit_of_known_inputs_begins_once_the_time_is_up(monkeypatch):
@@ -132,7 +132,7 @@ def test_what_is_damped_too_much_to_ring_is_no_driven_mode():
     )
     data = KnownInputs([record], at_rest=True, hold="zero", feedthrough=False)
     fit = modal_fit.settled(data, modal_fit.projected(data, poles, np.ones((2, 1), complex)))
-    found, (remark,) = _without_artefacts(data, Selected(fit, np.ones(2), 1.0, False), TimeLimit())
+    found, (remark,) = _without_artefacts(data, SelectedModes(fit, np.ones(2), 1.0, False), TimeLimit())
     np.testing.assert_allclose(np.abs(fit.poles), omega, rtol=0.02)
     np.testing.assert_allclose(np.abs(found.fit.poles), omega[:1], rtol=1e-3)
     assert "by more than 0.3" in remark and "poles at 19" in remark

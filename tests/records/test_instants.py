@@ -122,7 +122,7 @@ def test_a_row_is_that_of_the_file(tmp_path):
 
 
 def test_an_axis_of_unknown_name_is_no_reason_to_state_a_rate(tmp_path):
-    """A rate beside it would make a signal of the clock, or a record of transfer functions."""
+    """A rate beside it would make a signal of the clock, or a record of FRFs."""
     with pytest.raises(RecordFileError, match=r"unless 'Speed', which rises all along, is one: call it time \[s\]"):
         read(tmp_path, [f"{t:.3f}" for t in EVEN], name="Speed")
 

@@ -384,7 +384,7 @@ def test_units_of_universal_files(tmp_path, axes, system, scale, step, remark):
 
 
 @pytest.mark.parametrize("labels", [("g", "kN"), ("g/kN", "NONE")])
-def test_units_of_universal_transfer_functions(tmp_path, labels):
+def test_units_of_universal_frfs(tmp_path, labels):
     spectrum = np.arange(4.0) + 1j
     axes = {"func_type": 4, "data": spectrum, "abscissa_spec_data_type": 18, "ordinate_axis_units_lab": labels[0],
             "orddenom_axis_units_lab": labels[1], "abscissa_axis_units_lab": "kHz"}  # fmt: skip
@@ -398,9 +398,9 @@ def test_units_of_universal_transfer_functions(tmp_path, labels):
 @pytest.mark.parametrize(
     ("axes", "words"),
     [
-        ({"func_type": 2, "abscissa_spec_data_type": 18}, "no transfer function, but auto spectrum"),
-        ({"func_type": 9, "abscissa_spec_data_type": 18}, "no transfer function, but power spectral density"),
-        ({"func_type": 6, "abscissa_spec_data_type": 18}, "no transfer function, but coherence"),
+        ({"func_type": 2, "abscissa_spec_data_type": 18}, "no FRF, but auto spectrum"),
+        ({"func_type": 9, "abscissa_spec_data_type": 18}, "no FRF, but power spectral density"),
+        ({"func_type": 6, "abscissa_spec_data_type": 18}, "no FRF, but coherence"),
         ({"func_type": 0, "abscissa_spec_data_type": 18}, "no signal over time"),
         ({"ordinate_axis_units_lab": "N"}, "acceleration by its type and force by its unit"),
     ],

@@ -94,15 +94,17 @@ def test_band_limited_inputs_are_a_first_order_hold_of_many_steps(late):
 SLOW = {"delay": 1.3 * DT, "time_constant": 0.05, "bias": 0.2}
 
 
-@pytest.mark.parametrize(("ports", "within"), [({}, 1e-9), (SLOW, 2e-2), ({"rate_limit": 30.0}, 6e-2)])
-def test_steps_follow_the_closed_form_and_converge(ports, within):
+@pytest.mark.parametrize(("transducers", "within"), [({}, 1e-9), (SLOW, 2e-2), ({"rate_limit": 30.0}, 6e-2)])
+def test_steps_follow_the_closed_form_and_converge(transducers, within):
     u, spring = command(), (CubicSpring("y", 1e-12),)  # so weak that only the way to the result differs
     found = [
-        simulate(rig(elements=spring, **ports), u, sample_time=DT, input_hold="first", substeps=n).outputs
+        simulate(rig(elements=spring, **transducers), u, sample_time=DT, input_hold="first", substeps=n).outputs
         for n in (4, 8, 64)
     ]
     exact = (
-        found[-1] if "rate_limit" in ports else simulate(rig(**ports), u, sample_time=DT, input_hold="first").outputs
+        found[-1]
+        if "rate_limit" in transducers
+        else simulate(rig(**transducers), u, sample_time=DT, input_hold="first").outputs
     )
     error = [np.abs(each[:2] - exact[:2]).max() / np.abs(exact[:2]).max() for each in found]
     assert error[0] < within and error[1] <= max(0.5 * error[0], 1e-9)

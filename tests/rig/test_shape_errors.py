@@ -25,7 +25,7 @@ def modes(shapes):
 
 
 def rigs():
-    """One with errors at its ports, and one of modes that have them."""
+    """One with errors at its transducers, and one of modes that have them."""
     force, read = Actuator("F", "p", shape_error=tuple(ERROR[0])), Sensor("a", "r", "acceleration")
     late = replace(read, shape_error=tuple(ERROR[2]), delay=0.013, gain=2.0)
     return (

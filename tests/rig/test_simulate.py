@@ -203,7 +203,7 @@ def test_stiffness_drift_against_an_adaptive_integrator():
 @pytest.mark.parametrize("input_hold", ["zero", "first"])
 @pytest.mark.parametrize("ends", ["hinged", "free"])
 @pytest.mark.parametrize(
-    "port",
+    "transducer",
     [
         {"delay": 0.137},
         {"delay": 0.2},
@@ -215,11 +215,11 @@ def test_stiffness_drift_against_an_adaptive_integrator():
     ],
     ids=str,
 )
-def test_delays_and_lags_are_exact_beside_a_law_too(port, ends, input_hold):
+def test_delays_and_lags_are_exact_beside_a_law_too(transducer, ends, input_hold):
     """One substep a sample, in which the highest mode goes through five cycles, on the stepped route and the linear."""
     both = {**vars(beam()), "left": ends, "right": ends, "damping": ModalDamping((1.5, *29 * (0.01,)))}
     modes = Beam(**both).modes(30 if ends == "hinged" else 20)
-    actuators = (Actuator("F1", 2.0, **port), Actuator("F2", 6.3))
+    actuators = (Actuator("F1", 2.0, **transducer), Actuator("F2", 6.3))
     exact, stepped = (rig(laws, modes, actuators) for laws in ((), (CubicSpring(4.0, 0.0),)))
     linear = simulate(exact, drive(100), sample_time=DT, input_hold=input_hold).outputs
     for substeps in (1, 3):

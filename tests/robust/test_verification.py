@@ -71,15 +71,15 @@ def test_forces_neither_hide_growth_nor_pass_for_it(rig):
         actuators=tuple(replace(a, limit=0.2) for a in rig.actuators),
         elements=(LinearSpring(0.8, -1.5 * rig.modes.omega[0] ** 2),),
     )
-    n, port = 600, (Actuator("shaker", 0.83, direct=True),)
+    n, shaker = 600, (Actuator("shaker", 0.83, direct=True),)
     noise = np.random.default_rng(0).standard_normal((1, n))
     for scale, stays in ((1e-4, True), (0.5, True), (2.0, False)):
-        test = LoopTest(n, 0.01, forces=scale * noise, ports=port)
+        test = LoopTest(n, 0.01, forces=scale * noise, exciters=shaker)
         assert verify([held], controller, test).stable.all() is np.bool_(stays)
     ramp = np.linspace(0.0, 1.0, n)[None]
     at_resonance = np.sin(rig.modes.omega[3] * 0.01 * np.arange(n))[None]
     for force in (ramp, ramp**4, np.full((1, n), 0.5), at_resonance, noise):
-        assert verify([rig], controller, LoopTest(n, 0.01, forces=force, ports=port)).stable.all()
+        assert verify([rig], controller, LoopTest(n, 0.01, forces=force, exciters=shaker)).stable.all()
     hummed = replace(rig, elements=(PeriodicForce(0.83, rig.modes.omega[3] / (2 * np.pi), 1.0, 0.0),))
     assert verify([hummed], controller, LoopTest(n, 0.01)).stable.all()
 

@@ -13,7 +13,7 @@ from workbench.design.loop.rig_loop import LoopTest, run_loop
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
-from workbench.trials.controlled import Controlled, control_plant
+from workbench.trials.controlled import PlantResponse, control_plant
 from workbench.trials.plant import Plant
 
 DT = 0.01
@@ -57,7 +57,7 @@ def test_a_loop_settles_when_its_energy_stays_below_a_hundredth_of_its_peak(mode
     def energies(time):
         return np.array([np.exp(-2.0 * time), 0.05 * np.exp(-0.5 * time)])
 
-    run = Controlled(energies(DT * np.arange(1000)), np.zeros(2), 0.0, 0.0, True, DT, np.zeros((1, 1000)))
+    run = PlantResponse(energies(DT * np.arange(1000)), np.zeros(2), 0.0, 0.0, True, DT, np.zeros((1, 1000)))
     peak = energies(0.0)[:modes].sum()
     settled = brentq(lambda time: energies(time)[:modes].sum() - 0.01 * peak, 0.0, 10.0)
     assert settled <= run.settling(modes) <= settled + 1.01 * DT
@@ -65,4 +65,4 @@ def test_a_loop_settles_when_its_energy_stays_below_a_hundredth_of_its_peak(mode
 
 def test_a_loop_that_still_swings_when_the_test_ends_has_no_settling_time():
     energy = np.ones((1, 100))
-    assert Controlled(energy, np.zeros(1), 0.0, 0.0, True, DT, np.zeros((1, 100))).settling() is None
+    assert PlantResponse(energy, np.zeros(1), 0.0, 0.0, True, DT, np.zeros((1, 100))).settling() is None

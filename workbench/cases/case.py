@@ -182,7 +182,10 @@ def _read_record(
             raise CaseError(
                 f"{file}: output {sensor.name!r} is flat at {level:g}: check the sensor and its cable, or leave it out"
             )
-    inputs, outputs = (np.array([arrays[port.name] for port in ports]) for ports in (rig.actuators, rig.sensors))
+    inputs, outputs = (
+        np.array([arrays[transducer.name] for transducer in transducers])
+        for transducers in (rig.actuators, rig.sensors)
+    )
     record = rig.record(inputs, outputs, sample_time=sample_time, name=name, input_hold=_hold(entry, where))
     record = replace(
         record,

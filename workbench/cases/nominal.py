@@ -124,7 +124,7 @@ def _member_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: li
     if not isinstance(kind, str) or kind not in STRUCTURES:
         raise CaseError(f"[structure]: kind is beam, rod, plate or modal; got {said(kind, KINDS)}")
     check_keys(table, STRUCTURES[kind], "[structure]")
-    _check_ports(inputs, outputs, "at", kind)
+    _check_transducers(inputs, outputs, "at", kind)
     common: dict[str, Any] = {
         "length": number(table, "length", "[structure]"),
         "mass_per_length": profile(table, "mass_per_length"),
@@ -146,7 +146,7 @@ def _member_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: li
 
 def _plate_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: list[dict[str, Any]]) -> Rig:
     check_keys(table, PLATE, "[structure]")
-    _check_ports(inputs, outputs, "at", "plate")
+    _check_transducers(inputs, outputs, "at", "plate")
     edges = table.get("edges")
     if not isinstance(edges, dict):
         raise CaseError(f"[structure]: edges must be a table of {', '.join(EDGES)}; got {shown(edges)}")
@@ -172,18 +172,18 @@ def _modal_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: lis
     at_points = "points" in table
     single = "mass" in table and not at_points
     check_keys(table, SINGLE if single else MODAL, "[structure]")
-    _check_ports(inputs, outputs, "point" if at_points else "shape", "points" if at_points else "modal")
-    ports = [("[[input]]", e) for e in inputs] + [("[[output]]", e) for e in outputs]
-    points = NamedPoints(tuple(e["name"] for _, e in ports))
+    _check_transducers(inputs, outputs, "point" if at_points else "shape", "points" if at_points else "modal")
+    transducers = [("[[input]]", e) for e in inputs] + [("[[output]]", e) for e in outputs]
+    points = NamedPoints(tuple(e["name"] for _, e in transducers))
     if single:
         mass = number(table, "mass", "[structure]", low=1e-300)
         stiffness = number(table, "stiffness", "[structure]", low=0.0)
         omega = np.array([np.sqrt(stiffness / mass)])
         damping = np.array([[number(table, "damping", "[structure]", low=0.0) / mass]])
-        for _, entry in ports:
+        for _, entry in transducers:
             if entry.get("shape", [1.0]) != [1.0]:
                 raise CaseError(f"{entry['name']!r}: the shape of a single degree of freedom is [1.0]; leave it out")
-        values = np.full((len(ports), 1), 1.0 / np.sqrt(mass))
+        values = np.full((len(transducers), 1), 1.0 / np.sqrt(mass))
     else:
         omega = 2.0 * np.pi * numbers(table, "natural_frequencies_hz", "[structure]")
         damping = _modal_damping(table, omega)
@@ -191,7 +191,7 @@ def _modal_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: lis
             file = inside(path.parent, text(table, "points", "[structure]"), "[structure] points")
             points, values = read_points(file, omega.size)
         else:
-            values = np.array([numbers(e, "shape", f"{key} {e['name']!r}", omega.size) for key, e in ports])
+            values = np.array([numbers(e, "shape", f"{key} {e['name']!r}", omega.size) for key, e in transducers])
     modes = Modes(omega=omega, damping=damping, shapes=PointShapes(values), domain=points)
     return _rig_of(modes, inputs, outputs, lambda e, where: text(e, "point", where) if at_points else e["name"])
 
@@ -220,17 +220,17 @@ def _modal_damping(table: dict[str, Any], omega: np.ndarray) -> np.ndarray:
     return np.diag(rates)
 
 
-def _check_ports(inputs: list[dict[str, Any]], outputs: list[dict[str, Any]], place: str, kind: str) -> None:
+def _check_transducers(inputs: list[dict[str, Any]], outputs: list[dict[str, Any]], place: str, kind: str) -> None:
     more = MORE[kind]
     for key, entries, keys in (("input", inputs, (*INPUT, *more[0])), ("output", outputs, (*OUTPUT, *more[1]))):
         for entry in entries:
             check_keys(entry, (*keys, place), f"[[{key}]] {entry['name']!r}")
 
 
-def _check_place(port: Actuator | Sensor, modes: Modes, where: str) -> None:
+def _check_place(transducer: Actuator | Sensor, modes: Modes, where: str) -> None:
     """Refuse a place outside the structure, or a direction or axis that the structure does not have at this place."""
     try:
-        modes.phi_at(port.at, derivative_of(port), direction=port.direction)
+        modes.phi_at(transducer.at, derivative_of(transducer), direction=transducer.direction)
     except PlaceError as error:
         raise CaseError(f"{where}: {error}") from None
 

@@ -25,7 +25,7 @@ from workbench.structure.supports import NAMED_EDGES, NAMED_ENDS, Edge, End
 
 POINTS = "points.csv"
 Support = TypeVar("Support", End, Edge)
-Port = Actuator | Sensor
+Transducer = Actuator | Sensor
 
 
 def write_case(case: Case, folder: str | Path) -> Path:
@@ -56,19 +56,19 @@ def write_case(case: Case, folder: str | Path) -> Path:
 
 def _rig(rig: Rig, folder: Path) -> list[str]:
     """The tables [structure], [[input]] and [[output]]; named points are written to a table in the folder."""
-    _check_ports(rig)
+    _check_transducers(rig)
     structure, points = rig.structure, rig.modes.domain
     if isinstance(structure, Structure):
-        return [_member(structure, rig.modes.n_modes), *_ports(rig, at=_along)]
+        return [_member(structure, rig.modes.n_modes), *_transducers(rig, at=_along)]
     if isinstance(structure, Plate):
-        return [_plate(structure, rig.modes.n_modes), *_ports(rig, at=_over)]
+        return [_plate(structure, rig.modes.n_modes), *_transducers(rig, at=_over)]
     if not isinstance(points, NamedPoints):
         raise ValueError(
             "a case folder describes a beam, a rod, a plate, or modes at named points; this rig is a membrane, or has"
             " no structure"
         )
     write_points(folder / POINTS, points, rig.modes.phi(points.names))
-    return [_modal(rig.modes), *_ports(rig, at=lambda port: {"point": port.at})]
+    return [_modal(rig.modes), *_transducers(rig, at=lambda transducer: {"point": transducer.at})]
 
 
 def _member(member: Structure, n_modes: int) -> str:
@@ -158,7 +158,7 @@ def _named(support: Support, names: tuple[str, ...], known: Mapping[str, Support
     raise ValueError(f"the case format has no name for {support}; use {', '.join(names)}")
 
 
-def _check_ports(rig: Rig) -> None:
+def _check_transducers(rig: Rig) -> None:
     """Refuse properties of actuators, sensors and elements that a case file cannot describe.
 
     Raises:
@@ -169,22 +169,30 @@ def _check_ports(rig: Rig) -> None:
             f"the case format has no elements of the nominal rig; take {type(rig.elements[0]).__name__} out"
         )
     moments = isinstance(rig.structure, Beam | Plate) or isinstance(rig.modes.domain, NamedPoints)
-    ports: tuple[Port, ...] = (*rig.actuators, *rig.sensors)
-    for port in ports:
-        moment = isinstance(port, Actuator) and port.quantity == "moment"
-        plain = Sensor(port.name, port.at) if isinstance(port, Sensor) else Actuator(port.name, port.at, port.quantity)
-        kept = ["direct"] if isinstance(port, Actuator) else ["quantity", "noise_std"]
+    transducers: tuple[Transducer, ...] = (*rig.actuators, *rig.sensors)
+    for transducer in transducers:
+        moment = isinstance(transducer, Actuator) and transducer.quantity == "moment"
+        plain = (
+            Sensor(transducer.name, transducer.at)
+            if isinstance(transducer, Sensor)
+            else Actuator(transducer.name, transducer.at, transducer.quantity)
+        )
+        kept = ["direct"] if isinstance(transducer, Actuator) else ["quantity", "noise_std"]
         kept += ["direction"] * (not isinstance(rig.structure, Structure))
-        other = [f.name for f in fields(port) if f.name not in kept and getattr(port, f.name) != getattr(plain, f.name)]
+        other = [
+            f.name
+            for f in fields(transducer)
+            if f.name not in kept and getattr(transducer, f.name) != getattr(plain, f.name)
+        ]
         other += ["a moment"] * (moment and not moments)
-        if other or (isinstance(port.at, Between) and not (moment and isinstance(rig.structure, Beam))):
+        if other or (isinstance(transducer.at, Between) and not (moment and isinstance(rig.structure, Beam))):
             raise ValueError(
-                f"{port.name!r} has {other[0] if other else 'two places'}; the case format describes only ideal point"
-                " forces, moments, piezo patches and sensors at one place"
+                f"{transducer.name!r} has {other[0] if other else 'two places'}; the case format describes only ideal"
+                " point forces, moments, piezo patches and sensors at one place"
             )
 
 
-def _ports(rig: Rig, *, at: Callable[[Port], dict[str, Any]]) -> list[str]:
+def _transducers(rig: Rig, *, at: Callable[[Transducer], dict[str, Any]]) -> list[str]:
     """Tables of the inputs and outputs; `at` returns the keys and values of a place."""
     blocks = []
     for a in rig.actuators:
@@ -198,26 +206,30 @@ def _ports(rig: Rig, *, at: Callable[[Port], dict[str, Any]]) -> list[str]:
     return blocks
 
 
-def _direction(port: Port) -> dict[str, str]:
+def _direction(transducer: Transducer) -> dict[str, str]:
     """The key of the direction of a force or motion, or of the axis of a moment or rotation; none if it has none."""
-    turning = port.quantity == "moment" if isinstance(port, Actuator) else MEASURED[port.quantity][0] == 1
-    if port.direction is None or (not turning and not isinstance(port.at, str)):  # a plate moves along its normal
+    turning = (
+        transducer.quantity == "moment" if isinstance(transducer, Actuator) else MEASURED[transducer.quantity][0] == 1
+    )
+    if transducer.direction is None or (
+        not turning and not isinstance(transducer.at, str)
+    ):  # a plate moves along its normal
         return {}
-    return {"axis" if turning else "direction": port.direction}
+    return {"axis" if turning else "direction": transducer.direction}
 
 
-def _along(port: Port) -> dict[str, Any]:
+def _along(transducer: Transducer) -> dict[str, Any]:
     """Keys of a place along a member, and of the length of a patch."""
-    if isinstance(port.at, Between):
-        return {"at": middle(port.at), "patch": position(port.at.first) - position(port.at.second)}
-    return {"at": port.at}
+    if isinstance(transducer.at, Between):
+        return {"at": middle(transducer.at), "patch": position(transducer.at.first) - position(transducer.at.second)}
+    return {"at": transducer.at}
 
 
-def _over(port: Port) -> dict[str, Any]:
+def _over(transducer: Transducer) -> dict[str, Any]:
     """Keys of a place on a plate, and of the sides of a patch."""
-    if isinstance(port.at, Patch):
-        return {"at": list(port.at[:2]), "patch": [port.at.width, port.at.height]}
-    return {"at": list(port.at)}  # type: ignore[arg-type]
+    if isinstance(transducer.at, Patch):
+        return {"at": list(transducer.at[:2]), "patch": [transducer.at.width, transducer.at.height]}
+    return {"at": list(transducer.at)}  # type: ignore[arg-type]
 
 
 def _table(header: str, **entries: object) -> str:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from workbench.cli.options import DAMPING, ESTIMATORS
 from workbench.rig.rig import Rig
-from workbench.structure.domain import Between, Domain, Interval, NamedPoints, Patch, Place, PlaceError, Where
+from workbench.structure.domain import Between, Domain, Interval, Location, NamedPoints, Patch, Place, PlaceError
 
 if TYPE_CHECKING:
     from workbench.design.estimation.controller import Controller
@@ -126,7 +126,7 @@ def law_from(
     weight: float | None,
     damping: float | None,
     *,
-    impulse_at: Where | None = None,
+    impulse_at: Location | None = None,
     impulse: float = 1.0,
 ) -> "Law | OnOffLaw":
     """The law of this name, with a weight or a damping ratio.

@@ -53,7 +53,7 @@ def diagnose(
         bool,
         typer.Option("--uncorrected", help="Go on in spite of faults of wiring and units, without correcting them."),
     ] = False,
-    settle: Annotated[
+    transient: Annotated[
         float, typer.Option(help="Time at the start of each record that is left out, where it starts in motion, s.")
     ] = 0.0,
     workers: options.Workers = None,
@@ -93,9 +93,9 @@ def diagnose(
         )
     elif case is not None:
         found = read_case(case)
-    check_alive(found.rig, found.fit, found.validation, settle=settle)
+    check_alive(found.rig, found.fit, found.validation, transient=transient)
     check_disjoint(found.fit, found.validation)
-    faults = setup_faults(found.rig, found.fit, found.validation, settle=settle)
+    faults = setup_faults(found.rig, found.fit, found.validation, transient=transient)
     for fault in faults:
         say(f"  {'corrected' if correct and fault.certain else 'set-up'}     {fault.sentence}")
     if any(fault.certain for fault in faults) and not (correct or uncorrected):
@@ -106,7 +106,12 @@ def diagnose(
     corrected = [f"Corrected before the diagnosis: {fault.sentence}" for fault in faults if correct and fault.certain]
     with reporting("reading") as report:
         verdict = diagnose_case(
-            found, uncertain_nominal=uncertain_nominal, settle=settle, workers=workers, seconds=seconds, progress=report
+            found,
+            uncertain_nominal=uncertain_nominal,
+            transient=transient,
+            workers=workers,
+            seconds=seconds,
+            progress=report,
         )
     print_result(by_options(str(verdict)))
     verdict = replace(verdict, notes=(*corrected, *verdict.notes))

@@ -48,7 +48,7 @@ def identify(
     ] = "",
     band_hz: Annotated[
         tuple[float, float] | None,
-        typer.Option(metavar="LOW HIGH", help="Frequency band of transfer functions to fit."),
+        typer.Option(metavar="LOW HIGH", help="Frequency band of FRFs to fit."),
     ] = None,
     seconds: Annotated[float, typer.Option(help="Processor time of the search, s.")] = 30.0,
     memory: options.Memory = 1.0,
@@ -58,7 +58,7 @@ def identify(
     ] = None,
     json_path: options.JsonPath = None,
 ) -> None:
-    """Identify modes from free decays, driven or ambient records, or transfer functions, with standard errors.
+    """Identify modes from free decays, driven or ambient records, or FRFs, with standard errors.
 
     Example: workbench identify ringdown.csv --outputs a,b --json modes.json
     """

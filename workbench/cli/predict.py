@@ -13,7 +13,7 @@ from workbench.cli.terminal import (
     reporting,
     say,
     short,
-    stretch,
+    sub_progress,
     write_json,
 )
 from workbench.cli.uncertain import uncertain_rig
@@ -72,8 +72,8 @@ def predicted(
 
     check_draws(draws)  # before the diagnosis
     with reporting("reading") as report:
-        uncertain, noise = uncertain_rig(case, verdict, workers=workers, report=stretch(report, 0.0, 0.7))
-        progress = stretch(report, 0.7, 1.0)
+        uncertain, noise = uncertain_rig(case, verdict, workers=workers, report=sub_progress(report, 0.0, 0.7))
+        progress = sub_progress(report, 0.7, 1.0)
         found = predict_record(uncertain, record, noise_std=noise, draws=draws, seed=seed, progress=progress)
     return replace(found, channels=in_units(found.channels, case.units))
 

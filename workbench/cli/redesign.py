@@ -15,7 +15,7 @@ from workbench.cli.terminal import (
     say,
     short,
     show_table,
-    stretch,
+    sub_progress,
     write_json,
 )
 from workbench.cli.uncertain import uncertain_rig
@@ -107,7 +107,7 @@ def redesign(
     if estimator is not None:
         in_use = observed(rig, own, estimator, disturbance=disturbance, sample_time=sample_time)
     with reporting("reading") as report:
-        uncertain, _ = uncertain_rig(found, verdict, workers=workers, report=stretch(report, 0.0, 0.7))
+        uncertain, _ = uncertain_rig(found, verdict, workers=workers, report=sub_progress(report, 0.0, 0.7))
         result = run(
             uncertain,
             in_use,
@@ -118,7 +118,7 @@ def redesign(
             more_cost=more_cost,
             more_work=more_work,
             units=found.units,
-            progress=stretch(report, 0.7, 1.0),
+            progress=sub_progress(report, 0.7, 1.0),
         )
     say(f"{result.advice} {result.guarantee}".rstrip(), bold=True)
     say(result.comparison)

@@ -136,7 +136,7 @@ def reporting(first: str) -> Iterator[Callable[[str, float], None]]:
         yield report
 
 
-def stretch(report: Callable[[str, float], None], start: float, end: float) -> Callable[[str, float], None]:
+def sub_progress(report: Callable[[str, float], None], start: float, end: float) -> Callable[[str, float], None]:
     """A report from 0 to 1 that moves the progress bar from one share to another."""
     return lambda what, share: report(what, start + (end - start) * share)
 

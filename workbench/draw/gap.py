@@ -14,15 +14,15 @@ from workbench.arrays import Floats
 from workbench.draw.style import COLOURS, GREY, MODEL_COLOURS, RAISED, few_ticks, in_units, new_figure, plain_ticks
 from workbench.gap.effects.effect import apply_all, label_in_words
 from workbench.gap.effects.nonlinear import any_beyond
-from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.localisation.force_reconstruction import ForceReconstruction
 from workbench.gap.report.budget import Budget
 from workbench.gap.report.verdict import Verdict
 from workbench.records.record import Record
 from workbench.records.units import Units
 from workbench.rig.actuators import Actuator, force_unit
 from workbench.rig.rig import Rig
-from workbench.rig.simulate import predict
-from workbench.structure.domain import Between, NamedPoints, Rectangle, Where
+from workbench.rig.simulate import simulate_record
+from workbench.structure.domain import Between, Location, NamedPoints, Rectangle
 from workbench.structure.printed import joined_in_words
 
 MOST_BARS, FEW_BARS = 16, 6  # named points that are shown; sensors whose names fit horizontally
@@ -39,7 +39,7 @@ def plot_responses(rigs: Mapping[str, Rig], records: Sequence[Record], *, time_u
     records = list(records)[-3:]
     figure, axes = new_figure(len(records), 1, width=10, height=2.6 * len(records), squeeze=False)
     for ax, record in zip(axes[:, 0], records, strict=True):
-        outputs = {name: predict(rig, record) for name, rig in rigs.items()}
+        outputs = {name: simulate_record(rig, record) for name, rig in rigs.items()}
         first = next(iter(outputs.values()))
         spread = ((record.outputs - first) / record.outputs.std(axis=1, keepdims=True)) ** 2
         j = int(spread.mean(axis=1).argmax())
@@ -257,7 +257,7 @@ def _numbered(ticks: Floats) -> list[str]:
     return [f"≤ {numbers[0]}", *numbers[1:]]
 
 
-def _short(where: Where) -> str:
+def _short(where: Location) -> str:
     return " to ".join(map(str, where)) if isinstance(where, Between) else str(where)
 
 
@@ -270,12 +270,12 @@ def plot_unmodelled_force(verdict: Verdict, *, length: str | None = None, force:
     """
     units = verdict.units
     length, force = length or units.length, force or units.force
-    evidence = verdict.attribution.evidence
+    reconstruction = verdict.attribution.reconstruction
     chosen = [e for e in verdict.effects if e.at is not None and e.kind.path == "structure"]
     beside = [e for e in verdict.effects if chosen and e is not chosen[0]]
     if beside:
-        evidence = Evidence.of(apply_all(verdict.nominal, beside), verdict.attribution.search.data)
-    place = evidence.place(chosen[0].at if chosen else verdict.where.at)
+        reconstruction = ForceReconstruction.of(apply_all(verdict.nominal, beside), verdict.attribution.search.data)
+    place = reconstruction.place(chosen[0].at if chosen else verdict.where.at)
     figure, axes = new_figure(1, 2, width=10, height=3.8, sharey=True)
     there = verdict.nominal.modes.domain.text(place.at)
     there = there if isinstance(place.at, Between) else f"at {there}"

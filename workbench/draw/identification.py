@@ -13,7 +13,7 @@ from workbench.arrays import Flags
 from workbench.draw.style import COLOURS, GREY, few_ticks, new_figure
 from workbench.identification.free_decay.ibrahim import STABILITY, Stabilisation
 from workbench.identification.shapes.bands import Bands
-from workbench.identification.signal.modal_estimates import Refined
+from workbench.identification.signal.modal_estimates import RefinedModes
 from workbench.structure.modes import Modes, SampledModes, mac
 
 MOST_NUMBERED = 12  # modes of a MAC matrix whose values are written in its cells
@@ -50,7 +50,7 @@ def _stays(modes: SampledModes, stayed: SampledModes) -> Flags:
     return np.asarray((near & alike).any(axis=1) & (modes.zeta > 0.0) & (modes.zeta < STABILITY.most_damped))
 
 
-def plot_standard_errors(refined: Refined) -> Figure:
+def plot_standard_errors(refined: RefinedModes) -> Figure:
     """Relative standard errors of the frequency and damping ratio of each mode."""
     figure, axes = new_figure(2, 1, width=9, height=5, sharex=True)
     modes = np.arange(1, refined.modes.n_modes + 1)

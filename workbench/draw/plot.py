@@ -19,7 +19,7 @@ from workbench.draw.gap import plot_where
 from workbench.draw.identification import plot_bands, plot_standard_errors
 from workbench.draw.placement import plot_placement, plot_sensor_placement
 from workbench.draw.robust import plot_prediction, plot_redesign
-from workbench.draw.signals import plot_distortion, plot_record, plot_transfer
+from workbench.draw.signals import plot_distortion, plot_frf_matrix, plot_record
 from workbench.draw.style import COLOURS, GREY, new_figure, panels
 from workbench.draw.surface import (
     plot_point_modes,
@@ -31,9 +31,9 @@ from workbench.draw.surface import (
 from workbench.gap.report.verdict import Verdict
 from workbench.identification.shapes.bands import Bands
 from workbench.identification.signal.distortion import Distortion
-from workbench.identification.signal.modal_estimates import ModalEstimates, Refined
+from workbench.identification.signal.modal_estimates import ModalEstimates, RefinedModes
+from workbench.records.frequency_responses import FrequencyResponses
 from workbench.records.record import Record
-from workbench.records.transfer_functions import TransferFunctions
 from workbench.robust.prediction import Prediction
 from workbench.robust.redesign import Redesign
 from workbench.structure.domain import NamedPoints, Rectangle
@@ -45,9 +45,9 @@ MOST_INSTANTS = 5
 
 @singledispatch
 def plot(result: object) -> Figure:
-    """A figure of a result: `Record`, `TransferFunctions`, `Modes`, `SampledModes`, estimates of modes, `Refined`,
-    `Bands`, `Response`, `Spillover`, `Explanation`, `ControlledModeCount`, `Placement`, `SensorPlacement`,
-    `ModalFilter`, `Distortion`, `Verdict`, `Redesign` or `Prediction`.
+    """A figure of a result: `Record`, `FrequencyResponses`, `Modes`, `SampledModes`, estimates of modes,
+    `RefinedModes`, `Bands`, `Response`, `Spillover`, `Explanation`, `ControlledModeCount`, `Placement`,
+    `SensorPlacement`, `ModalFilter`, `Distortion`, `Verdict`, `Redesign` or `Prediction`.
 
     Raises:
         TypeError: a type that has no figure.
@@ -85,8 +85,8 @@ def _(result: SampledModes) -> Figure:
 
 
 plot.register(Record, plot_record)
-plot.register(TransferFunctions, plot_transfer)
-plot.register(Refined, plot_standard_errors)
+plot.register(FrequencyResponses, plot_frf_matrix)
+plot.register(RefinedModes, plot_standard_errors)
 plot.register(Placement, plot_placement)
 plot.register(Explanation, plot_spillover_paths)
 plot.register(Verdict, plot_where)

@@ -10,9 +10,9 @@ from scipy.signal import coherence, csd, welch
 from workbench.arrays import Floats
 from workbench.draw.style import COLOURS, GREY, envelope, in_units, new_figure
 from workbench.identification.signal.distortion import Distortion
-from workbench.identification.signal.frequency_responses import FrequencyResponses
+from workbench.identification.signal.frequency_responses import FrfEstimate
+from workbench.records.frequency_responses import FrequencyResponses
 from workbench.records.record import Channel, Record
-from workbench.records.transfer_functions import TransferFunctions
 
 SEGMENT_SAMPLES = 4096  # at most
 SHOWN = 1e-12  # least power that is drawn, over the largest
@@ -88,11 +88,11 @@ def _panel_per_signal(record: Record, *, height: float) -> tuple[Figure, list[tu
     return figure, [(ax, *signal) for ax, signal in zip(axes[:, 0], signals)]
 
 
-def plot_transfer(measured: TransferFunctions, fitted: TransferFunctions | None = None) -> Figure:
-    """Magnitude and phase of each output's transfer functions, all inputs in one panel.
+def plot_frf_matrix(measured: FrequencyResponses, fitted: FrequencyResponses | None = None) -> Figure:
+    """Magnitude and phase of each output's FRFs, all inputs in one panel.
 
     Args:
-        fitted: transfer functions of a model, at any frequencies, drawn dashed.
+        fitted: FRFs of a model, at any frequencies, drawn dashed.
     """
     channels = measured.output_channels[:MOST_PANELS]
     figure, axes = new_figure(len(channels), 2, width=10, height=0.8 + 1.6 * len(channels), sharex=True, squeeze=False)
@@ -110,14 +110,14 @@ def plot_transfer(measured: TransferFunctions, fitted: TransferFunctions | None 
         angle.set(ylabel="phase [°]", ylim=(-190.0, 190.0), yticks=(-180, -90, 0, 90, 180))
     if fitted or len(measured.references) > 1:
         axes[0, 0].legend(fontsize=8)
-    axes[0, 0].set_title("transfer functions: magnitude")
+    axes[0, 0].set_title("FRFs: magnitude")
     axes[0, 1].set_title("phase")
     for ax in axes[-1]:
         ax.set_xlabel("frequency [Hz]")
     return figure
 
 
-def frequency_response(record: Record) -> TransferFunctions:
+def frequency_response(record: Record) -> FrequencyResponses:
     """The response of each output to the single input, H1 = S_uy / S_uu, by Welch's method; NaN where S_uu is small.
 
     Raises:
@@ -132,7 +132,7 @@ def frequency_response(record: Record) -> TransferFunctions:
     for response, row in zip(values[:, 0], record.outputs, strict=True):
         cross = csd(u, row - row.mean(), rate, nperseg=segment)[1]
         np.divide(cross, power, out=response, where=power > SHOWN * power.max())
-    return TransferFunctions(values[..., 1:], lines[1:], record.output_channels, record.input_names, name=record.name)
+    return FrequencyResponses(values[..., 1:], lines[1:], record.output_channels, record.input_names, name=record.name)
 
 
 def plot_coherence(record: Record) -> Figure:
@@ -172,13 +172,13 @@ def plot_frf(record: Record) -> Figure:
     return figure
 
 
-def plot_frf_of_inputs(found: FrequencyResponses, fitted: TransferFunctions | None = None) -> Figure:
+def plot_frf_of_inputs(found: FrfEstimate, fitted: FrequencyResponses | None = None) -> Figure:
     """Frequency responses to several inputs, a panel per output and a line per input, and the multiple coherence.
 
     Args:
         fitted: those of the identified modes, at any frequencies, drawn dashed.
     """
-    measured, same = found.transfer, len(set(found.units)) == 1
+    measured, same = found.frf, len(set(found.units)) == 1
     named = [name if same or not unit else f"{name} [{unit}]" for name, unit in zip(measured.references, found.units)]
     channels, n = measured.output_channels, len(measured.output_channels)
     figure, axes = new_figure(n + 1, 1, width=9, height=2.0 + 2.1 * n, sharex=True, height_ratios=[3] * n + [2])
@@ -213,7 +213,7 @@ def _nonzero(row: np.ndarray) -> Floats:
     return np.where(np.abs(row) > 0, np.abs(row), np.nan)
 
 
-def _peak(fitted: TransferFunctions | None, output: str) -> float:
+def _peak(fitted: FrequencyResponses | None, output: str) -> float:
     """The largest magnitude to an output; NaN without any."""
     return np.nan if fitted is None else float(np.abs(fitted.values[fitted.output_names.index(output)]).max())
 

@@ -12,8 +12,8 @@ from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all, can_be, names_in
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior, NominalPrior
 from workbench.gap.effects.nonlinear import any_beyond
+from workbench.gap.localisation.breakdown import break_down
 from workbench.gap.localisation.force_location import locate_force
-from workbench.gap.localisation.where import locate
 from workbench.gap.prediction.noise import LOGGED, noise_guessed
 from workbench.gap.prediction.residuals import lead_of
 from workbench.gap.prediction.workers import Workers
@@ -44,7 +44,7 @@ from workbench.records.record import Record, as_records
 from workbench.records.units import SI, Units
 from workbench.renamed import former_arguments
 from workbench.rig.rig import Rig
-from workbench.rig.simulate import predict
+from workbench.rig.simulate import simulate_record
 from workbench.threads import one_blas_thread
 
 LIKELY = 0.01  # probability from which an alternative deserves an experiment
@@ -61,7 +61,7 @@ SECONDS = 120.0  # of processor time of this process and one beside it: twice wh
 SEARCH_SHARE = 0.8  # of that time; the rest is for intervals, budget and the next experiment
 
 
-@former_arguments(free_nominal="uncertain_nominal", report="progress")
+@former_arguments(free_nominal="uncertain_nominal", report="progress", settle="transient")
 @one_blas_thread
 def diagnose(
     rig: Rig,
@@ -73,7 +73,7 @@ def diagnose(
     progress: Callable[[str, float], None] = lambda text, share: None,
     workers: int | None = None,
     seconds: float | None = SECONDS,
-    settle: float = 0.0,
+    transient: float = 0.0,
     uncertain_nominal: bool = False,
     tolerance: float = TOLERANCE,
     identified: IdentifiedPrior | None = None,
@@ -93,7 +93,7 @@ def diagnose(
         workers: processes that share the work, this one included; None for one per core.
         seconds: of processor time of this process, doubled if it works alone, after which the search ends with the best
             set so far, and the verdict says so; None for no limit. Compilation is not counted.
-        settle: seconds at the start of each record that are simulated but not counted, if records do not start at rest.
+        transient: seconds at the start of each record simulated but not compared, as it does not start at rest.
         uncertain_nominal: fit nominal errors jointly with every effect from the first.
         tolerance: of the signal's rms: a gap above the noise that is smaller in every record, or below a tenth of the
             noise, is reported but not explained. A residual of an explained gap below it is noted, if above the noise.
@@ -120,25 +120,25 @@ def diagnose(
     if not records:
         raise ValueError("a diagnosis needs at least one record to fit; got none")
     shortest = min(record.n_samples * record.sample_time for record in (*records, *validation))
-    if not 0.0 <= settle < shortest:
+    if not 0.0 <= transient < shortest:
         raise ValueError(
-            f"settle must be 0 or more and less than the shortest record, {shortest:g} s; got {settle:g} s"
+            f"transient must be 0 or more and less than the shortest record, {shortest:g} s; got {transient:g} s"
         )
     check_modes(rig)
-    check_records(rig, records, validation, settle=settle)
+    check_records(rig, records, validation, transient=transient)
     check_disjoint(records, validation)
     without_noise = frozenset(sensor.name for sensor in rig.sensors if not sensor.noise_std)
     if without_noise:
         each = zip(rig.sensors, noise_guessed(rig, records), strict=True)
         rig = replace(rig, sensors=tuple(replace(s, noise_std=s.noise_std or float(guess)) for s, guess in each))
-    faults = setup_faults(rig, records, validation, settle=settle)
+    faults = setup_faults(rig, records, validation, transient=transient)
     progress("locating the unmodelled force", 0.02)
     exchanged = tuple(e for e in exchanges(faults, (*records, *validation)) if e.kind in catalogue)
     wired = apply_all(rig, exchanged)
-    seen, as_wired, evidence = baseline(
-        wired, records, settle=settle, guessed=without_noise, workers=sharing, deadline=deadline
+    seen, as_wired, reconstruction = baseline(
+        wired, records, transient=transient, guessed=without_noise, workers=sharing, deadline=deadline
     )
-    nominal, given, added = evidence.of_rig(rig) if exchanged else as_wired, (*exchanged, *seen), exchanged
+    nominal, given, added = reconstruction.of_rig(rig) if exchanged else as_wired, (*exchanged, *seen), exchanged
     with (
         sharing.in_background(lambda: locate_force(nominal.without(_faulty(given)))) as place,
         sharing.in_background(lambda: detectability(nominal, catalogue=catalogue)) as ready,
@@ -146,7 +146,7 @@ def diagnose(
         attribution = attribute(
             seen,
             as_wired,
-            evidence,
+            reconstruction,
             catalogue=catalogue,
             progress=progress,
             uncertain_nominal=uncertain_nominal,
@@ -155,22 +155,22 @@ def diagnose(
         )
         if attribution.missing:
             wired, added = apply_all(wired, attribution.missing), (*exchanged, *attribution.missing)
-            evidence = evidence.of_rig(apply_all(evidence.rig, attribution.missing))
+            reconstruction = reconstruction.of_rig(apply_all(reconstruction.rig, attribution.missing))
         if attribution.outcome == "explained" and attribution.random is None:
             # alternatives are fitted to the same whitened records as the best set
             alike, search = ready().indistinguishable, replace(attribution.search, data=attribution.whitened)
-            alternatives = with_equals(search, attribution.best, attribution.alternatives, evidence, alike)
+            alternatives = with_equals(search, attribution.best, attribution.alternatives, reconstruction, alike)
             attribution = replace(attribution, alternatives=alternatives)
-        attribution = _validated(wired, attribution, validation, settle)
+        attribution = _validated(wired, attribution, validation, transient)
         if added:
             attribution = attribution.with_given(added, nominal)
         corrected = apply_all(rig, attribution.best.effects)
-        shrinkage = measure(rig, corrected, validation, settle=settle)
-        accounted = with_held_out(rig, attribution.best.effects, validation, settle=settle)
-        beyond = _power_beyond_effects(rig, attribution, validation, settle, accounted)
+        shrinkage = measure(rig, corrected, validation, transient=transient)
+        accounted = with_held_out(rig, attribution.best.effects, validation, transient=transient)
+        beyond = _power_beyond_effects(rig, attribution, validation, transient, accounted)
         if _leaves_far_more_than_noise(attribution, shrinkage, beyond):
             attribution = replace(attribution, outcome="part")
-        disagreeing = _disagreeing(attribution, shrinkage, validation, settle, tolerance, beyond)
+        disagreeing = _disagreeing(attribution, shrinkage, validation, transient, tolerance, beyond)
         outcome = _outcome(attribution, shrinkage, beyond, disagreeing)
         errors = next((e for e in accounted if e.kind is NOMINAL_ERRORS), None)
         named = tuple(e for e in accounted if e is not errors)
@@ -183,15 +183,15 @@ def diagnose(
             errors=errors,
             records=validation or records,
             noise_found=attribution.noise,
-            settle=settle,
+            transient=transient,
         )
         budget = budget_for(effects, logged=_input_noise(attribution, outcome))
-        power = _residual_power(rig, (), validation or records, settle) / len(validation or records)
+        power = _residual_power(rig, (), validation or records, transient) / len(validation or records)
         if outcome == "explained" and _leaves_unexplained(budget, power, tolerance):
             attribution = replace(attribution, outcome="part")
             outcome, effects = _outcome(attribution, shrinkage, beyond, disagreeing), ()
             budget = budget_for(effects, logged=_input_noise(attribution, outcome))
-        where = locate(nominal, effects, place() if as_given else locate_force(nominal.without(faulty)))
+        where = break_down(nominal, effects, place() if as_given else locate_force(nominal.without(faulty)))
         verdict = Verdict(
             case=name,
             outcome=outcome,
@@ -210,7 +210,14 @@ def diagnose(
             units=units,
         )
         notes = notes_of(
-            verdict, records, validation, faults=faults, errors=errors, power=power, settle=settle, seconds=seconds
+            verdict,
+            records,
+            validation,
+            faults=faults,
+            errors=errors,
+            power=power,
+            transient=transient,
+            seconds=seconds,
         )
         return replace(verdict, notes=notes)
 
@@ -220,7 +227,7 @@ def _faulty(effects: Sequence[Effect]) -> set[str]:
     return {name for effect in effects if effect.kind.path == "sensor" for name in names_in(effect.target)}
 
 
-def _validated(rig: Rig, found: Attribution, held_out: Sequence[Record], settle: float) -> Attribution:
+def _validated(rig: Rig, found: Attribution, held_out: Sequence[Record], transient: float) -> Attribution:
     """The attribution without effects that act on held-out records but do not reduce their residual.
 
     Any law fits some of the residual of the fitted records. An effect stays if only implausibly large nominal errors
@@ -229,29 +236,29 @@ def _validated(rig: Rig, found: Attribution, held_out: Sequence[Record], settle:
     """
     effects = found.best.effects
     if found.outcome in ("part", "unknown") and not _unpredictable(found):
-        with_none = _residual_power(rig, found.seen, held_out, settle)
+        with_none = _residual_power(rig, found.seen, held_out, transient)
         kept = tuple(e for e in effects if e.is_in_readings or e.stands_out(rig))
-        while len(kept) > len(found.seen) and _residual_power(rig, kept, held_out, settle) > with_none:
+        while len(kept) > len(found.seen) and _residual_power(rig, kept, held_out, transient) > with_none:
             fewer = [tuple(e for e in kept if e is not one) for one in kept if not one.is_in_readings]
-            kept = min(fewer, key=lambda rest: _residual_power(rig, rest, held_out, settle))
+            kept = min(fewer, key=lambda rest: _residual_power(rig, rest, held_out, transient))
         dropped = [e for e in effects if e not in kept]
-        return _validated(rig, found.without(*dropped), held_out, settle) if dropped else found
+        return _validated(rig, found.without(*dropped), held_out, transient) if dropped else found
     named = [e for e in effects if not e.kind.applied_first and not e.is_in_readings]
     if found.outcome != "explained" or len(named) < 2 or not held_out or _unpredictable(found):
         return found
-    after = _residual_power(rig, effects, held_out, settle)
-    trifle = max(WORTH * after, TRIFLE * _residual_power(rig, (), held_out, settle))
+    after = _residual_power(rig, effects, held_out, transient)
+    trifle = max(WORTH * after, TRIFLE * _residual_power(rig, (), held_out, transient))
     for effect in named:
         rest = [e for e in effects if e is not effect]
-        if _power_of_difference(rig, effects, rest, held_out, settle) < WORTH * after:
+        if _power_of_difference(rig, effects, rest, held_out, transient) < WORTH * after:
             continue
         # most effects count decisively even with the others unchanged; else the others are refitted
-        if _residual_power(rig, rest, held_out, settle) < DECISIVE * (after + trifle):
+        if _residual_power(rig, rest, held_out, transient) < DECISIVE * (after + trifle):
             without = found.without(effect)
             if _errors_are_plausible(effects) and not _errors_are_plausible(without.best.effects):
                 continue
-            if _residual_power(rig, without.best.effects, held_out, settle) < after + trifle:
-                return _validated(rig, without, held_out, settle)
+            if _residual_power(rig, without.best.effects, held_out, transient) < after + trifle:
+                return _validated(rig, without, held_out, transient)
     return found
 
 
@@ -260,20 +267,23 @@ def _errors_are_plausible(effects: Sequence[Effect]) -> bool:
     return not any(too_large(effect) for effect in effects if isinstance(effect.target, NominalPrior))
 
 
-def _residual_power(rig: Rig, effects: Sequence[Effect], held_out: Sequence[Record], settle: float) -> float:
+def _residual_power(rig: Rig, effects: Sequence[Effect], held_out: Sequence[Record], transient: float) -> float:
     """Mean square residual of a rig with effects, summed over records, each sensor scaled by its standard deviation."""
-    return float(sum(residual_powers(rig, effects, held_out, settle)))
+    return float(sum(residual_powers(rig, effects, held_out, transient)))
 
 
 def _power_of_difference(
-    rig: Rig, effects: Sequence[Effect], others: Sequence[Effect], held_out: Sequence[Record], settle: float
+    rig: Rig, effects: Sequence[Effect], others: Sequence[Effect], held_out: Sequence[Record], transient: float
 ) -> float:
     """Mean square difference of the readings between two sets of effects, in the units of `_residual_power`."""
     if not can_be(rig, others):
         return np.inf
     one, other = apply_all(rig, effects), apply_all(rig, others)
     with np.errstate(over="ignore", invalid="ignore"):  # without one of two effects in balance, a response may diverge
-        return sum(signal_power(record, predict(one, record) - predict(other, record), settle) for record in held_out)
+        return sum(
+            signal_power(record, simulate_record(one, record) - simulate_record(other, record), transient)
+            for record in held_out
+        )
 
 
 def _outcome(found: Attribution, shrinkage: Shrinkage | None, beyond: np.ndarray, disagreeing: Sequence[str]) -> str:
@@ -322,7 +332,7 @@ def _leaves_far_more_than_noise(found: Attribution, shrinkage: Shrinkage | None,
 
 
 def _power_beyond_effects(
-    rig: Rig, found: Attribution, held_out: Sequence[Record], settle: float, accounted: Sequence[Effect]
+    rig: Rig, found: Attribution, held_out: Sequence[Record], transient: float, accounted: Sequence[Effect]
 ) -> np.ndarray:
     """Mean square residual (n_records,) due to input noise and to parameters that vary from record to record.
 
@@ -330,9 +340,9 @@ def _power_beyond_effects(
     """
     beyond = np.zeros(len(held_out))
     if found.logged and held_out:
-        beyond = found.logged**2 * power_of_inputs(rig, held_out, settle)
+        beyond = found.logged**2 * power_of_inputs(rig, held_out, transient)
     if any(effect not in found.best.effects for effect in accounted):
-        common, own = (residual_powers(rig, each, held_out, settle) for each in (found.best.effects, accounted))
+        common, own = (residual_powers(rig, each, held_out, transient) for each in (found.best.effects, accounted))
         beyond = beyond + common - own
     return beyond
 
@@ -346,7 +356,7 @@ def _disagreeing(
     found: Attribution,
     shrinkage: Shrinkage | None,
     held_out: Sequence[Record],
-    settle: float,
+    transient: float,
     tolerance: float,
     beyond: np.ndarray,
 ) -> tuple[str, ...]:
@@ -357,8 +367,8 @@ def _disagreeing(
     if found.outcome != "none" or shrinkage is None:
         return ()
     before, after, _ = _powers(shrinkage)
-    noise = beyond + [noise_power(record, found.noise, settle) for record in held_out]
-    chance = [CHANCE * np.sqrt(2.0 / (r.n_outputs * (r.n_samples - lead_of(r, settle)))) for r in held_out]
+    noise = beyond + [noise_power(record, found.noise, transient) for record in held_out]
+    chance = [CHANCE * np.sqrt(2.0 / (r.n_outputs * (r.n_samples - lead_of(r, transient)))) for r in held_out]
     tolerated = (1.0 - LEAST_CLOSED_WITH_ERRORS) ** 2 if found.best.effects else 0.0
     least = np.max(
         [np.full(len(held_out), tolerance**2), (LARGEST_LEFT + np.array(chance)) * noise, tolerated * (before - noise)],

@@ -40,7 +40,7 @@ from workbench.identification.input_output.modal_fit import (
     scaled_vectors,
     settled,
 )
-from workbench.identification.input_output.model_order import Selected, SelectionOptions
+from workbench.identification.input_output.model_order import SelectedModes, SelectionOptions
 from workbench.identification.input_output.output_clock import clock_remarks, on_inputs_clock
 from workbench.identification.input_output.peak_shape import overlap_remarks
 from workbench.identification.input_output.quiet_start import begin_at_rest
@@ -72,7 +72,7 @@ DRIVEN = DrivenSettings()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Driven(ParticipatingModes):
+class DrivenModes(ParticipatingModes):
     """Modes with their participation factors: H(s) = {D + Σ_r [c_r l_r^T / (s - λ_r) + conjugate]} diag(e^{-sτ_i}).
 
     Attributes:
@@ -196,7 +196,7 @@ def identify_driven(
     seconds: float | None = SECONDS,
     progress: Progress | None = None,
     straight: bool | None = None,
-) -> Driven:
+) -> DrivenModes:
     """The modes between inputs and outputs, their number selected, with participation factors and standard errors.
 
     Any excitation of the modes serves: noise, multisine, PRBS, an impulse. A mode is included if it raises the
@@ -223,7 +223,7 @@ def identify_driven(
         straight: former name of `input_hold="first"`; it warns.
 
     Returns:
-        `Driven`. Its standard errors hold in noise of any smooth spectrum. They include white noise of the inputs,
+        `DrivenModes`. Its standard errors hold in noise of any smooth spectrum. They include white noise of the inputs,
         which is detected where two or more modes show it, with a remark.
 
     Raises:
@@ -343,8 +343,8 @@ def _checked_delays(records: Sequence[Record], delays: ArrayLike) -> np.ndarray:
 
 
 def _as_time_invariant(
-    data: KnownInputs, selected: Selected, time_limit: TimeLimit
-) -> tuple[KnownInputs, Selected, tuple[complex, ...]]:
+    data: KnownInputs, selected: SelectedModes, time_limit: TimeLimit
+) -> tuple[KnownInputs, SelectedModes, tuple[complex, ...]]:
     """The modes refitted as time-invariant, without the columns of changing modes, and the poles that change.
 
     Noise, standard errors and responses are then those of the model returned. No mode counts as changing if these
@@ -361,8 +361,8 @@ def _as_time_invariant(
 
 
 def _without_artefacts(
-    data: KnownInputs, selected: Selected, time_limit: TimeLimit
-) -> tuple[Selected, tuple[str, ...]]:
+    data: KnownInputs, selected: SelectedModes, time_limit: TimeLimit
+) -> tuple[SelectedModes, tuple[str, ...]]:
     """The modes refitted without poles that cannot be modes, and a remark on the poles left out."""
     out: list[float] = []
     fit = selected.fit
@@ -388,9 +388,9 @@ def _report(
     logged: Sequence[Record],
     records: Sequence[Record],
     data: KnownInputs,
-    selected: Selected,
+    selected: SelectedModes,
     remarks: tuple[str, ...],
-) -> Driven:
+) -> DrivenModes:
     """The result, with the noise of the inputs, where there is some, in its standard errors.
 
     Args:
@@ -424,7 +424,7 @@ def _report(
     if data.has_direct:
         direct = fit.coefficients[2 * n : 2 * n + n_inputs].T
         direct_std = fixed_std(fit, noise_ratio, fixed_ratio, from_inputs)[:n_inputs].T
-    return Driven(
+    return DrivenModes(
         modes=SampledModes.of_poles(fit.poles, shapes, records[0].positions),
         covariance=frozen(pole_covariance(fit, noise_ratio * shared, from_inputs)),
         vector_covariance=frozen(vectors),

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from workbench.arrays import symmetric_root
-from workbench.identification.driven import Driven
+from workbench.identification.driven import DrivenModes
+from workbench.identification.frf import FrfModes
 from workbench.identification.signal.clocks import are_far, far_from_real, shape_errors
 from workbench.identification.signal.modal_estimates import normalised_shapes, set_up_remarks
-from workbench.identification.transfer import TransferModes
 from workbench.records.record import Channel
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
@@ -44,11 +44,11 @@ def rig_from(
     nearest real mode is the largest singular value of Re A with its vectors. The product φ_j φ_i suffices to simulate
     responses to the inputs. The shapes themselves, needed to attach masses and springs, follow from a driving point,
     where φ_i = φ_j, or from modal masses. The residual of the direct term of accelerations, D - Σ_r φ_j φ_i, is
-    rigid-body motion: modes at 0 Hz, as far as the inputs excite them. For transfer functions it is the residual term
+    rigid-body motion: modes at 0 Hz, as far as the inputs excite them. For FRFs it is the residual term
     of modes below the band.
 
     Args:
-        identified: from `identify_driven` or `identify_transfer`, or from `identify_ambient`, `ring_down` or
+        identified: from `identify_driven` or `identify_frf`, or from `identify_ambient`, `ring_down` or
             `identify`, which know no inputs.
         inputs: channels of the inputs: not needed from `identify_driven`; where no input was measured, the names of
             outputs where forces are to act.
@@ -67,7 +67,7 @@ def rig_from(
     Warns:
         UserWarning: complex modes; shapes of unknown scale, so that only responses to these inputs are right; several
             rigid modes, likewise; a direct term that is left out, as it is not one of modes, or as not all outputs are
-            accelerations; modes outside the band of transfer functions that are left out, or taken as rigid.
+            accelerations; modes outside the band of FRFs that are left out, or taken as rigid.
 
     Source: Ewins, Modal Testing, 2nd ed., sections 2.4 and 4.4.
     """
@@ -80,10 +80,10 @@ def rig_from(
                 f"output {channel.name!r} measures {channel.quantity or 'an unnamed quantity'}; give outputs= with one"
                 f" of {', '.join(MEASURED)}"
             )
-    if isinstance(identified, Driven | TransferModes):
+    if isinstance(identified, DrivenModes | FrfModes):
         in_channels = _channels(identified, "input_channels", inputs, identified.participation.shape[1])
         shapes = _shapes_of_residues(identified, out_channels, in_channels, driving_point, modal_masses)
-        delays = identified.delays if isinstance(identified, Driven) else np.zeros(len(in_channels))
+        delays = identified.delays if isinstance(identified, DrivenModes) else np.zeros(len(in_channels))
         actuators = tuple(
             Actuator(c.name, c.name, quantity="moment" if c.quantity == "moment" else "force", delay=float(delay))
             for c, delay in zip(in_channels, delays, strict=True)
@@ -94,7 +94,7 @@ def rig_from(
         shapes.points.locate(names)
         actuators = tuple(Actuator(f"force at {name}", name) for name in names)
     noise = getattr(identified, "noise_std", [channel.noise_std or 0.0 for channel in out_channels])
-    late = identified.delays if isinstance(identified, TransferModes) else np.zeros(len(out_channels))
+    late = identified.delays if isinstance(identified, FrfModes) else np.zeros(len(out_channels))
     sensors = tuple(
         Sensor(c.name, c.name, quantity, noise_std=float(std), delay=float(delay))
         for c, quantity, std, delay in zip(out_channels, measured, np.atleast_1d(noise), late, strict=True)
@@ -168,7 +168,7 @@ class _RigidTerm:
 
 
 def _shapes_of_residues(
-    identified: Driven | TransferModes,
+    identified: DrivenModes | FrfModes,
     out: tuple[Channel, ...],
     into: tuple[Channel, ...],
     driving_point: tuple[str, str] | None,
@@ -205,7 +205,7 @@ def _shapes_of_residues(
     kept = [i % (len(out) + len(into)) for _, i in rows.values()]
     covariance = _propagated(identified, lambda residues: _mass_normalised(residues.real, pair, masses)[:, kept])
     values = np.hstack([at_out, at_in])[:, kept]
-    if isinstance(identified, Driven):
+    if isinstance(identified, DrivenModes):
         rigid_term = _rigid_of_direct_term(identified, out, pair, at_out.T @ at_in)
     else:
         rigid_term = _rigid_of_residual_term(identified, out, pair)
@@ -216,7 +216,7 @@ def _shapes_of_residues(
 
 
 def _rigid_of_direct_term(
-    identified: Driven, out: tuple[Channel, ...], pair: tuple[int, int] | None, elastic: np.ndarray
+    identified: DrivenModes, out: tuple[Channel, ...], pair: tuple[int, int] | None, elastic: np.ndarray
 ) -> _RigidTerm | None:
     """The residual of the direct term of accelerations, where it is rigid-body motion; None where it is not.
 
@@ -246,7 +246,7 @@ def _rigid_of_direct_term(
 
 
 def _rigid_of_residual_term(
-    identified: TransferModes, out: tuple[Channel, ...], pair: tuple[int, int] | None
+    identified: FrfModes, out: tuple[Channel, ...], pair: tuple[int, int] | None
 ) -> _RigidTerm | None:
     """The residual term of modes below the band, where it is rigid-body motion: where it dominates the lowest line.
 
@@ -334,7 +334,7 @@ def _mass_normalised(residues: np.ndarray, pair: tuple[int, int] | None, masses:
     return np.hstack([at_out * np.sqrt(ratio)[:, None], at_in / np.sqrt(ratio)[:, None]])
 
 
-def _propagated(identified: Driven | TransferModes, values: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+def _propagated(identified: DrivenModes | FrfModes, values: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """Covariance (n_modes, n_values, n_values) of a function of the residues, to first order.
 
     Errors of ω_d are neglected, which are small against those of the shapes.

@@ -30,7 +30,7 @@ from workbench.identification.signal.data_quality import (
     of_same_sensors,
 )
 from workbench.identification.signal.harmonics import multiple_of, near_mains
-from workbench.identification.signal.modal_estimates import Identified, OfRefined, Refined
+from workbench.identification.signal.modal_estimates import IdentifiedModes, RefinedEstimates, RefinedModes
 from workbench.identification.signal.projection import forget_transforms, power_of, power_sums, project
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Progress, TimeLimit
 from workbench.records.record import Record, as_records
@@ -69,7 +69,7 @@ WITHIN_ERROR = "damping no larger than its error"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RingDown(OfRefined):
+class RingDown(RefinedEstimates):
     """The modes of free decays.
 
     Attributes:
@@ -85,7 +85,7 @@ class RingDown(OfRefined):
     """
 
     records: tuple[Record, ...]
-    refined: Refined
+    refined: RefinedModes
     remarks: tuple[str, ...]
     noise_modes: SampledModes
     noise_statistic: np.ndarray
@@ -209,7 +209,7 @@ def _cut_to_decay(record: Record, start: float | None) -> tuple[Record, list[str
 
 def _identify_with_drift(
     records: list[Record], n_modes: int | None, time_limit: TimeLimit
-) -> tuple[Identified, list[Record], list[str]]:
+) -> tuple[IdentifiedModes, list[Record], list[str]]:
     """The modes, the records without drift, and notes; modes and drift are estimated alternately until both settle."""
     poles = np.zeros(0, complex)
     taken = _dominant_drifts(records)  # one per record once drift is removed
@@ -250,7 +250,7 @@ def _dominant_drifts(records: list[Record]) -> list[Drift]:
     return drifts if dominant and not any(_settles_within_a_period(drift) for drift in drifts) else []
 
 
-def _drift_changed(drifts: list[Drift], before: list[Drift], identified: Identified) -> bool:
+def _drift_changed(drifts: list[Drift], before: list[Drift], identified: IdentifiedModes) -> bool:
     """Whether drifts changed by more than a standard error: χ² of the change above one."""
     each = zip(drifts, before, identified.refined.noise, strict=True)
     changes = ((new.record.outputs - old.record.outputs) / noise[:, None] for new, old, noise in each)
@@ -264,13 +264,13 @@ def _settles_within_a_period(drift: Drift) -> bool:
     return drift.time_constant is not None and bool(drift.time_constant * omega < 2.0 * np.pi)
 
 
-def _identify(records: list[Record], n_modes: int | None, time_limit: TimeLimit) -> Identified:
+def _identify(records: list[Record], n_modes: int | None, time_limit: TimeLimit) -> IdentifiedModes:
     if n_modes is None:
         return identify_within(records, time_limit)
     return _refine_given(stacked_delays(records, n_modes=n_modes), records, time_limit)
 
 
-def _by_stabilisation(records: list[Record], time_limit: TimeLimit) -> Identified:
+def _by_stabilisation(records: list[Record], time_limit: TimeLimit) -> IdentifiedModes:
     highest = max(2, min(RING_DOWN.max_modes, min(record.n_samples for record in records) // 8))
     start = stable_modes(stabilise(records, orders=range(2, highest + 1))).modes
     if start.n_modes == 0:
@@ -279,10 +279,10 @@ def _by_stabilisation(records: list[Record], time_limit: TimeLimit) -> Identifie
     return _refine_given(start, records, time_limit)
 
 
-def _refine_given(start: SampledModes, records: list[Record], time_limit: TimeLimit) -> Identified:
+def _refine_given(start: SampledModes, records: list[Record], time_limit: TimeLimit) -> IdentifiedModes:
     """The modes of `start`, refined, without any test: no mode is rejected."""
     refined, none = in_coloured_noise(refine(records, start, offset=True, time_limit=time_limit), records), np.zeros(0)
-    return Identified(refined, none, 0.0, unshaped(none.astype(complex), records[0]), none)
+    return IdentifiedModes(refined, none, 0.0, unshaped(none.astype(complex), records[0]), none)
 
 
 def _check_undriven(record: Record) -> None:
@@ -334,7 +334,7 @@ WAY_OUT = (
 )
 
 
-def _check_decays(records: list[Record], refined: Refined) -> None:
+def _check_decays(records: list[Record], refined: RefinedModes) -> None:
     """Refuse records whose strongest mode has negative damping.
 
     Raises:
@@ -350,7 +350,7 @@ def _check_decays(records: list[Record], refined: Refined) -> None:
 
 
 def _large_residual(
-    records: list[Record], residuals: list[np.ndarray], refined: Refined, coloured: bool
+    records: list[Record], residuals: list[np.ndarray], refined: RefinedModes, coloured: bool
 ) -> tuple[str, ...]:
     """A remark where the residual is large in the bands of the modes: forces excite them throughout.
 
@@ -380,7 +380,7 @@ def _large_residual(
     return ()
 
 
-def _energy(refined: Refined, records: list[Record]) -> np.ndarray:
+def _energy(refined: RefinedModes, records: list[Record]) -> np.ndarray:
     """Energy of each mode over all records, (n_modes,), outputs in units of their noise."""
     energy = np.zeros(refined.modes.n_modes)
     for record, amplitudes, noise in zip(records, refined.amplitudes, refined.noise, strict=True):
@@ -388,12 +388,12 @@ def _energy(refined: Refined, records: list[Record]) -> np.ndarray:
     return energy
 
 
-def _envelope_energy(record: Record, refined: Refined) -> np.ndarray:
+def _envelope_energy(record: Record, refined: RefinedModes) -> np.ndarray:
     """Σ_t e^{-2σt} over a record for each mode, (n_modes,)."""
     return power_sums(np.exp(2.0 * record.sample_time * refined.modes.poles.real), record.n_samples)[0].real
 
 
-def _inconsistent_shapes(refined: Refined, records: list[Record], only: Sequence[int]) -> tuple[str, ...]:
+def _inconsistent_shapes(refined: RefinedModes, records: list[Record], only: Sequence[int]) -> tuple[str, ...]:
     """A remark on modes whose shapes differ between records beyond noise: their amplitudes have rank two.
 
     Two modes of the same pole are fitted as one pole, with a different mixture of their shapes in each record.
@@ -424,7 +424,7 @@ def _inconsistent_shapes(refined: Refined, records: list[Record], only: Sequence
     )
 
 
-def _undecaying(refined: Refined, records: list[Record]) -> tuple[str, ...]:
+def _undecaying(refined: RefinedModes, records: list[Record]) -> tuple[str, ...]:
     """A remark where most of the motion does not decay within the record."""
     span = max(record.n_samples * record.sample_time for record in records)
     undecaying = refined.modes.zeta * refined.modes.omega * span < 0.1
@@ -438,7 +438,7 @@ def _undecaying(refined: Refined, records: list[Record]) -> tuple[str, ...]:
     )
 
 
-def _ambient_excitation(refined: Refined, mode_remarks: Sequence[str]) -> tuple[str, ...]:
+def _ambient_excitation(refined: RefinedModes, mode_remarks: Sequence[str]) -> tuple[str, ...]:
     """A remark where modes of insignificant damping cluster about a significant one, an effect of ambient forces."""
     f, sure = refined.modes.frequencies_hz, np.array([not remark for remark in mode_remarks])
     undamped = refined.modes.zeta < SURE * refined.zeta_std
@@ -477,7 +477,7 @@ def by_remark(remarks: Sequence[str]) -> list[str]:
     return [f"mode{'s' * (len(which) > 1)} {joined_in_words(which)}: {remark}" for remark, which in modes.items()]
 
 
-def remarks(refined: Refined, records: Record | Sequence[Record]) -> tuple[str, ...]:
+def remarks(refined: RefinedModes, records: Record | Sequence[Record]) -> tuple[str, ...]:
     """One remark per mode, empty where there is none.
 
     A period longer than the record: a drift. A damping ratio not three standard errors above zero, which does not decay

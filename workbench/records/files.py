@@ -12,11 +12,11 @@ from types import ModuleType
 
 from workbench.records import csv_file, hdf5_file, mat_file, npz_file, tdms_file, uff_file, wav_file
 from workbench.records.assembly import KEY, checksum, facts_of, legible, record_of
+from workbench.records.frequency_responses import FrequencyResponses
+from workbench.records.frf_arrays import complex_columns, frfs_of, holds_frfs
 from workbench.records.limits import DEFAULT, ReadLimits, RecordFileError, check_file, reading
 from workbench.records.named_arrays import signals_of
 from workbench.records.record import Record
-from workbench.records.transfer_arrays import complex_columns, holds_transfer, transfer_of
-from workbench.records.transfer_functions import TransferFunctions
 from workbench.records.units import SI, Units
 
 FORMATS = {
@@ -69,10 +69,10 @@ def read_record(
     measured = read_measured(
         path, sample_rate_hz=sample_rate_hz, inputs=inputs, input_hold=input_hold, limits=limits, units=units
     )
-    if isinstance(measured, TransferFunctions):
+    if isinstance(measured, FrequencyResponses):
         raise RecordFileError(
-            f"{path} is complex: it holds transfer functions, no record. Identify their modes by `workbench identify`,"
-            " or by read_measured and identify_transfer"
+            f"{path} is complex: it holds FRFs, no record. Identify their modes by `workbench identify`,"
+            " or by read_measured and identify_frf"
         )
     return measured
 
@@ -86,16 +86,16 @@ def read_measured(
     input_hold: str | None = None,
     limits: ReadLimits = DEFAULT,
     units: Units = SI,
-) -> Record | TransferFunctions:
-    """The contents of a file: a record, or transfer functions where the data are complex.
+) -> Record | FrequencyResponses:
+    """The contents of a file: a record, or FRFs where the data are complex.
 
-    Transfer functions are complex arrays of MAT, NPZ or HDF5, shape ([n_outputs, [n_references,]] n_frequencies) with
+    FRFs are complex arrays of MAT, NPZ or HDF5, shape ([n_outputs, [n_references,]] n_frequencies) with
     the axes in any order, with their lines (`frequency_hz`, `f`, ..., or `omega`) or a sample rate; data sets 58 of
     UFF of function type 4; tables that begin with a column `frequency`, then `NAME real`, `NAME imag`, or
     `NAME magnitude`, `NAME phase [deg]`.
 
     Args:
-        path, inputs, input_hold, limits, units: as for `read_record`; transfer functions are always in SI.
+        path, inputs, input_hold, limits, units: as for `read_record`; FRFs are always in SI.
         outputs: names of the outputs to read, all unless given; what other channels hold does not matter then.
         sample_rate_hz: where the file itself has no time, or no lines, which are then from zero to the Nyquist
             frequency.
@@ -113,21 +113,19 @@ def read_measured(
             arrays = complex_columns(path, contents.signals) if contents.time is None else {}
         else:
             arrays = module.arrays(path, limits)
-            if not holds_transfer(arrays):
+            if not holds_frfs(arrays):
                 contents = signals_of(path, arrays)
                 arrays = {}
-    if holds_transfer(arrays):
+    if holds_frfs(arrays):
         if inputs or input_hold is not None:
-            raise RecordFileError(
-                f"{path} holds transfer functions, which name no inputs; leave them and their hold out"
-            )
-        transfer = transfer_of(path, arrays, sample_rate_hz=sample_rate_hz)
-        return transfer.select_outputs(outputs) if outputs else transfer
+            raise RecordFileError(f"{path} holds FRFs, which name no inputs; leave them and their hold out")
+        frf = frfs_of(path, arrays, sample_rate_hz=sample_rate_hz)
+        return frf.select_outputs(outputs) if outputs else frf
     record = record_of(path, contents, sample_rate_hz=sample_rate_hz, inputs=inputs, outputs=outputs, into=units)
     return record if input_hold is None else replace(record, input_hold=input_hold)
 
 
-def named_by_file(measured: Record | TransferFunctions, path: Path) -> Record | TransferFunctions:
+def named_by_file(measured: Record | FrequencyResponses, path: Path) -> Record | FrequencyResponses:
     """What was read from a file, by the file's name where it was stored under a name that nobody gave it."""
     unnamed = isinstance(measured, Record) and measured.name in GIVEN
     return replace(measured, name=path.stem) if unnamed else measured

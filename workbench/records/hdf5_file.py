@@ -11,9 +11,9 @@ import h5py
 import numpy as np
 
 from workbench.records.confined import load_confined
+from workbench.records.frf_arrays import PLACES
 from workbench.records.limits import BYTES_PER_NUMBER, ReadLimits, RecordFileError, check_counts
 from workbench.records.named_arrays import HEADER, check_struct, numbered
-from workbench.records.transfer_arrays import PLACES
 from workbench.records.units import time_factor, time_unit, unit_named
 
 UNIT = ("unit", "units")  # attributes

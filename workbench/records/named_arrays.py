@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from workbench.records.assembly import Signals
+from workbench.records.frf_arrays import SURE_RATES
 from workbench.records.instants import in_seconds
 from workbench.records.limits import RecordFileError, check_counts
-from workbench.records.transfer_arrays import SURE_RATES
 from workbench.records.units import time_factor
 
 HEADER = "record_header"
@@ -55,7 +55,7 @@ def signals_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Signals:
     lengths = {values.size for values in numbers if values.size == max(values.shape)}
     for name, values in arrays.items():
         if values.dtype.kind == "c" and values.size > 1:
-            raise RecordFileError(f"{path}, channel {name!r} is complex: is it a transfer function?")
+            raise RecordFileError(f"{path}, channel {name!r} is complex: is it an FRF?")
         if values.dtype.kind not in "fiub" or values.size == 1:
             continue
         if values.ndim > 1 and 1 not in values.shape:

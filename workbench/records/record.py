@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from workbench.renamed import Renamed
-from workbench.structure.domain import Where, place_array, same_place
+from workbench.structure.domain import Location, place_array, same_place
 from workbench.structure.modes import frozen
 from workbench.structure.printed import Constructed, Printed, counted, place_text
 
@@ -45,7 +45,7 @@ class Channel(Constructed):
     name: str
     quantity: str = ""
     unit: str = ""
-    at: Where | None = None
+    at: Location | None = None
     noise_std: float | None = None
 
     def __post_init__(self) -> None:

@@ -12,16 +12,16 @@ import pyuff
 
 from workbench.records.assembly import unit_remark
 from workbench.records.confined import load_confined
+from workbench.records.frf_arrays import description
 from workbench.records.limits import ReadLimits, RecordFileError
 from workbench.records.named_arrays import HEADER
-from workbench.records.transfer_arrays import description
 from workbench.records.units import BY_QUANTITY, UNITS, unit_named
 
 # ordinate_spec_data_type of the format
 TYPES = {"displacement": 8, "velocity": 11, "acceleration": 12, "force": 13}
 QUANTITIES = {code: name for name, code in TYPES.items()}
 LINE = 80
-TRANSFER = 4  # func_type of the format
+FRF = 4  # func_type of the format
 FUNCTIONS = {2: "auto spectrum", 3: "cross spectrum", 5: "transmissibility", 6: "coherence",
              9: "power spectral density", 10: "energy spectral density", 12: "spectrum"}  # fmt: skip
 OVER_TIME = (0, 1, 7, 8)  # general or unknown, time response, auto and cross correlation
@@ -44,9 +44,9 @@ def load(path: Path, limits: ReadLimits) -> dict[str, np.ndarray]:
     if not sets:
         raise RecordFileError(f"{path} holds no data set 58")
     system = next((s for s in every if s.get("type") == 164), None)
-    transfer = [s for s in sets if s["func_type"] == TRANSFER]
-    if transfer:
-        return _transfer(path, transfer, system)
+    frf = [s for s in sets if s["func_type"] == FRF]
+    if frf:
+        return _frfs(path, frf, system)
     over_time = [
         (number, entry)
         for number, entry in enumerate(sets, start=1)
@@ -58,8 +58,8 @@ def load(path: Path, limits: ReadLimits) -> dict[str, np.ndarray]:
             for s in sets
         ]
         raise RecordFileError(
-            f"{path} holds no signal over time and no transfer function, but {', '.join(dict.fromkeys(held))}; export"
-            " time responses (function type 1) or transfer functions (4)"
+            f"{path} holds no signal over time and no FRF, but {', '.join(dict.fromkeys(held))}; export"
+            " time responses (function type 1) or FRFs (4)"
         )
     arrays: dict[str, np.ndarray] = {}
     channels, record = [], None
@@ -68,7 +68,7 @@ def load(path: Path, limits: ReadLimits) -> dict[str, np.ndarray]:
         where = f"{path}, data set {number}"
         data = np.asarray(entry["data"])
         if np.iscomplexobj(data):
-            raise RecordFileError(f"{where} is complex, but not marked as a transfer function (function type 4)")
+            raise RecordFileError(f"{where} is complex, but not marked as an FRF (function type 4)")
         if data.size != entry["num_pts"]:
             raise RecordFileError(f"{where} holds {data.size} samples and states {entry['num_pts']}: it is damaged")
         key, facts = _channel(where, entry, name, system)
@@ -115,14 +115,14 @@ def _whole(data: bytes) -> bool:
     return sum(line.rstrip() == MARK for line in data.splitlines()) % 2 == 0
 
 
-def _transfer(path: Path, sets: list[dict[str, Any]], system: dict[str, Any] | None) -> dict[str, np.ndarray]:
-    """The transfer functions of all pairs of response and reference as one array, in SI, with their lines and names."""
-    lines = _abscissa(f"{path}, transfer function 1", sets[0], "frequency")
+def _frfs(path: Path, sets: list[dict[str, Any]], system: dict[str, Any] | None) -> dict[str, np.ndarray]:
+    """The FRFs of all pairs of response and reference as one array, in SI, with their lines and names."""
+    lines = _abscissa(f"{path}, FRF 1", sets[0], "frequency")
     found: dict[tuple[str, str], np.ndarray] = {}
     outputs: dict[str, dict[str, str]] = {}
     remarks: dict[str, None] = {}
     for number, entry in enumerate(sets, start=1):
-        where = f"{path}, transfer function {number}"
+        where = f"{path}, FRF {number}"
         x = _abscissa(where, entry, "frequency")
         data = np.asarray(entry["data"], complex)
         if x.shape != lines.shape or data.shape != lines.shape or np.abs(x - lines).max() > 1e-6 * np.abs(lines).max():
@@ -146,7 +146,7 @@ def _transfer(path: Path, sets: list[dict[str, Any]], system: dict[str, Any] | N
             continue
         if (reference, output) not in found or outputs[reference] != outputs[output]:
             raise RecordFileError(
-                f"{path} lacks the transfer function from {reference} to {output}; export those of one reference, or of"
+                f"{path} lacks the FRF from {reference} to {output}; export those of one reference, or of"
                 " all to every output"
             )
         mirrored.append((output, reference))
@@ -155,7 +155,7 @@ def _transfer(path: Path, sets: list[dict[str, Any]], system: dict[str, Any] | N
         remarks[f"by reciprocity, those from {named}"] = None
         found |= {(output, reference): found[reference, output] for output, reference in mirrored}
     values = np.array([[found[output, reference] for reference in references] for output in outputs])
-    return {"frequency_hz": lines, "transfer": values, **description(outputs, references, remarks)}
+    return {"frequency_hz": lines, "frf": values, **description(outputs, references, remarks)}
 
 
 def as_stored(values: np.ndarray) -> np.ndarray:

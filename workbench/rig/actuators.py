@@ -7,7 +7,7 @@ import numpy as np
 
 from workbench.arrays import Floats
 from workbench.renamed import Renamed, former_arguments
-from workbench.structure.domain import Between, Patch, Place, PlaceError, Where, centred_at, same_place
+from workbench.structure.domain import Between, Location, Patch, Place, PlaceError, centred_at, same_place
 from workbench.structure.printed import Constructed
 
 
@@ -40,7 +40,7 @@ class Actuator(Constructed):
     """
 
     name: str
-    at: Where
+    at: Location
     quantity: str = "force"
     gain: float = 1.0
     dead_zone: float = 0.0
@@ -178,5 +178,5 @@ def piezo_patch(
         raise PlaceError(
             f"piezo patch {name}: its middle is x along a beam, or (x, y) on a plate; got {at!r}"
         ) from None
-    where: Where = Patch(x, *y, *sides.tolist()) if on_plate else centred_at(Between(sides[0], 0.0), x)
+    where: Location = Patch(x, *y, *sides.tolist()) if on_plate else centred_at(Between(sides[0], 0.0), x)
     return Actuator(name, where, quantity="moment", gain=gain, direction=direction)

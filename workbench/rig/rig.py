@@ -21,50 +21,54 @@ WITHOUT_UNIT = ("gain", "hysteresis_share", "hysteresis_width", "direction")  # 
 KEPT = 8  # rigs in a cache of arrays that all records share
 
 
-def derivative_of(port: Actuator | Sensor) -> int:
-    """Order of the shapes' spatial derivative at a port: 0 for a force or a displacement, 1 for a moment or a slope."""
-    return int(port.quantity == "moment") if isinstance(port, Actuator) else MEASURED[port.quantity][0]
+def derivative_of(transducer: Actuator | Sensor) -> int:
+    """Order of the shapes' spatial derivative at an actuator or sensor: 1 for a moment or a slope, else 0."""
+    return (
+        int(transducer.quantity == "moment") if isinstance(transducer, Actuator) else MEASURED[transducer.quantity][0]
+    )
 
 
-def shape_of(modes: Modes, port: Actuator | Sensor) -> Floats:
+def shape_of(modes: Modes, transducer: Actuator | Sensor) -> Floats:
     """Mode shapes, or their slopes, at an actuator or a sensor: (n_modes,), without its gain, with its `shape_error`.
 
     Raises:
         PlaceError: a place or direction that the structure does not have; the message names the actuator or sensor.
     """
     try:
-        shape = modes.phi_at(port.at, derivative_of(port), direction=port.direction)
+        shape = modes.phi_at(transducer.at, derivative_of(transducer), direction=transducer.direction)
     except PlaceError as error:
-        raise _misplaced(port, error) from None
-    return shape + _shape_error(port, modes.n_modes) if port.shape_error else shape
+        raise _misplaced(transducer, error) from None
+    return shape + _shape_error(transducer, modes.n_modes) if transducer.shape_error else shape
 
 
-def shapes_at(modes: Modes, ports: Sequence[Actuator | Sensor]) -> Floats:
-    """Mode shapes (n_ports, n_modes) at the ports of a rig, as of `shape_of`, those of one kind computed at once."""
-    shapes = np.empty((len(ports), modes.n_modes))
+def shapes_at(modes: Modes, transducers: Sequence[Actuator | Sensor]) -> Floats:
+    """Mode shapes (n_transducers, n_modes), as of `shape_of`; those of one kind are computed at once."""
+    shapes = np.empty((len(transducers), modes.n_modes))
     at_points: dict[tuple[str, str | None], list[int]] = {}
-    for j, port in enumerate(ports):
-        if isinstance(port.at, Between | Patch):
-            shapes[j] = modes.phi_at(port.at, derivative_of(port), direction=port.direction)
+    for j, transducer in enumerate(transducers):
+        if isinstance(transducer.at, Between | Patch):
+            shapes[j] = modes.phi_at(transducer.at, derivative_of(transducer), direction=transducer.direction)
         else:
-            at_points.setdefault((port.quantity, port.direction), []).append(j)
+            at_points.setdefault((transducer.quantity, transducer.direction), []).append(j)
     for (_, direction), here in at_points.items():
-        shapes[here] = modes.phi([ports[j].at for j in here], derivative_of(ports[here[0]]), direction=direction)
-    for j, port in enumerate(ports):
-        if port.shape_error:
-            shapes[j] += _shape_error(port, modes.n_modes)
+        shapes[here] = modes.phi(
+            [transducers[j].at for j in here], derivative_of(transducers[here[0]]), direction=direction
+        )
+    for j, transducer in enumerate(transducers):
+        if transducer.shape_error:
+            shapes[j] += _shape_error(transducer, modes.n_modes)
     return shapes
 
 
-def _shape_error(port: Actuator | Sensor, n_modes: int) -> Floats:
-    """Errors (n_modes,) of the mode shapes at a port; zero for modes beyond those of its `shape_error`."""
-    known = port.shape_error[:n_modes]
+def _shape_error(transducer: Actuator | Sensor, n_modes: int) -> Floats:
+    """Errors (n_modes,) of the mode shapes at a transducer; zero for modes beyond those of its `shape_error`."""
+    known = transducer.shape_error[:n_modes]
     return np.pad(known, (0, n_modes - len(known)))
 
 
-def _misplaced(port: Actuator | Sensor, error: PlaceError) -> PlaceError:
-    what = "actuator" if isinstance(port, Actuator) else "sensor"
-    return PlaceError(f"{what} {port.name}: {error}")
+def _misplaced(transducer: Actuator | Sensor, error: PlaceError) -> PlaceError:
+    what = "actuator" if isinstance(transducer, Actuator) else "sensor"
+    return PlaceError(f"{what} {transducer.name}: {error}")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -106,12 +110,12 @@ class Rig(Printed):
 
     def _check_places(self) -> None:
         domain = self.modes.domain
-        ports: tuple[Actuator | Sensor, ...] = (*self.actuators, *self.sensors)
-        for port in ports:
+        transducers: tuple[Actuator | Sensor, ...] = (*self.actuators, *self.sensors)
+        for transducer in transducers:
             try:
-                check_place(domain, port.at, derivative_of(port), port.direction)
+                check_place(domain, transducer.at, derivative_of(transducer), transducer.direction)
             except PlaceError as error:
-                raise _misplaced(port, error) from None
+                raise _misplaced(transducer, error) from None
         for element in self.elements:
             where = getattr(element, "at", None)  # None of a distributed element
             if where is not None:
@@ -164,13 +168,13 @@ class Rig(Printed):
         return line, headings[:shown], [row[:shown] for row in rows], ()
 
 
-def _properties(port: Actuator | Sensor) -> str:
+def _properties(transducer: Actuator | Sensor) -> str:
     """The properties of an actuator or a sensor that differ from their defaults: delay 0.004 s, gain 0.3, limit 2 N."""
-    unit = force_unit(port) if isinstance(port, Actuator) else QUANTITIES[port.quantity]
+    unit = force_unit(transducer) if isinstance(transducer, Actuator) else QUANTITIES[transducer.quantity]
     units = {"delay": "s", "time_constant": "s", "rate_limit": f"{unit}/s", **dict.fromkeys(WITHOUT_UNIT, "")}
     texts = []
-    for each in fields(port):
-        value, words = getattr(port, each.name), each.name.replace("_", " ")
+    for each in fields(transducer):
+        value, words = getattr(transducer, each.name), each.name.replace("_", " ")
         if each.name in ("name", "at", "quantity") or value == each.default:
             continue
         if each.name == "crosstalk":

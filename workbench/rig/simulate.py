@@ -66,7 +66,7 @@ def simulate(
     return rig.record(inputs, read(rig, motion), sample_time=sample_time, name=name, input_hold=input_hold)
 
 
-def predict(rig: Rig, record: Record, *, substeps: int = 8) -> np.ndarray:
+def simulate_record(rig: Rig, record: Record, *, substeps: int = 8) -> np.ndarray:
     """Noise-free readings (n_sensors, n_samples) of a rig under the inputs of a record; see `simulate`."""
     rig = rig.in_record(record.name)
     simulated = simulate(

@@ -12,7 +12,7 @@ from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED
 from workbench.rig.statespace import input_matrix, output_matrix
 from workbench.robust.compensation import check_rate
-from workbench.structure.domain import Between, Domain, NamedPoints, Patch, Where
+from workbench.structure.domain import Between, Domain, Location, NamedPoints, Patch
 from workbench.structure.modes import Modes
 
 PERIODS = 25  # of the lowest controlled mode: the length of a test
@@ -24,7 +24,7 @@ def impulse_test(
     rig: Rig,
     controlled: Sequence[int],
     sample_time: float,
-    impulse_at: Where | None = None,
+    impulse_at: Location | None = None,
     *,
     level: np.ndarray | None = None,
     seed: int | None = 0,
@@ -70,7 +70,7 @@ def impulse_test(
     return replace(test, impulse=float(np.median(peaks)) if peaks else 1.0)
 
 
-def _impulse_place(rig: Rig, controlled: Sequence[int], given: Where | None) -> Where:
+def _impulse_place(rig: Rig, controlled: Sequence[int], given: Location | None) -> Location:
     """A place where an impulse moves the controlled modes: the given one, or by default that of `impulse_test`."""
     places = rig.modes.domain.grid(GRID)
     shapes = np.abs(rig.modes.phi(places))
@@ -86,21 +86,21 @@ def _impulse_place(rig: Rig, controlled: Sequence[int], given: Where | None) -> 
             " controller; choose another place"
         )
     moved = shapes[:, list(controlled)]
-    most: Where = places[int((moved / np.maximum(moved.max(axis=0), 1e-300)).min(axis=1).argmax())]
+    most: Location = places[int((moved / np.maximum(moved.max(axis=0), 1e-300)).min(axis=1).argmax())]
     return most
 
 
-def _place_of(domain: Domain, port: Actuator) -> Where:
+def _place_of(domain: Domain, exciter: Actuator) -> Location:
     """The place of an actuator; of a node with a direction, the point that moves in that direction."""
-    if not isinstance(domain, NamedPoints) or port.direction is None:
-        return port.at
-    places = port.at if isinstance(port.at, Between) else (port.at,)
-    names, _, _ = domain.slope(list(places), int(port.quantity == "moment"), port.direction)
-    return Between(*names) if isinstance(port.at, Between) else names[0]
+    if not isinstance(domain, NamedPoints) or exciter.direction is None:
+        return exciter.at
+    places = exciter.at if isinstance(exciter.at, Between) else (exciter.at,)
+    names, _, _ = domain.slope(list(places), int(exciter.quantity == "moment"), exciter.direction)
+    return Between(*names) if isinstance(exciter.at, Between) else names[0]
 
 
 def impulse_speeds(
-    modes: Modes, index: Sequence[int], impulse: float, at: Where | None, actuator: Actuator
+    modes: Modes, index: Sequence[int], impulse: float, at: Location | None, actuator: Actuator
 ) -> np.ndarray:
     """|q_r'| (n_index,) just after an impulse, at least a tenth of the largest.
 

@@ -12,7 +12,7 @@ from workbench.rig.actuators import without_crosstalk
 from workbench.rig.rig import Rig
 from workbench.rig.statespace import input_matrix
 from workbench.robust.impulse import impulse_speeds
-from workbench.structure.domain import Where
+from workbench.structure.domain import Location
 
 KINDS = ("imsc", "coupled", "poles", "on-off")
 PERIODS = 5.0  # within which on-off control stops each mode
@@ -25,7 +25,7 @@ def plain_law(
     controlled: int | Sequence[int] | None = None,
     *,
     damping: float = 0.1,
-    impulse_at: Where | None = None,
+    impulse_at: Location | None = None,
     impulse: float = 1.0,
 ) -> Law | OnOffLaw:
     """A law of a kind with settings by a rule of thumb.

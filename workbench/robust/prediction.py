@@ -383,10 +383,10 @@ def _with_disturbances(rig: Rig, sent: Floats, rng: np.random.Generator) -> tupl
     sensors = [replace(sensor, limit=np.inf, step=0.0) for sensor in rig.sensors]
     random = [element for element in rig.elements if isinstance(element, RandomForce)]
     others = [element for element in rig.elements if not isinstance(element, RandomForce)]
-    ports = [Actuator(f"random force {i + 1}", element.at, direct=True) for i, element in enumerate(random)]
+    sources = [Actuator(f"random force {i + 1}", element.at, direct=True) for i, element in enumerate(random)]
     forces = [element.rms * rng.standard_normal(sent.shape[1]) for element in random]
-    with_ports = replace(rig, sensors=tuple(sensors), elements=tuple(others), actuators=(*rig.actuators, *ports))
-    return with_ports, np.vstack([sent, *forces])
+    with_sources = replace(rig, sensors=tuple(sensors), elements=tuple(others), actuators=(*rig.actuators, *sources))
+    return with_sources, np.vstack([sent, *forces])
 
 
 def _unexplained(truth: Floats, share: float, frequencies: Floats, bands: Floats, rng: np.random.Generator) -> Floats:

@@ -25,7 +25,7 @@ from workbench.robust.relocation import relocated
 from workbench.robust.small_motion import modes_in_motion
 from workbench.robust.steps import Search, Step, force_weight, weighted
 from workbench.robust.verification import check_test, drawn_with_errors, verify
-from workbench.structure.domain import Where
+from workbench.structure.domain import Location
 from workbench.threads import one_blas_thread
 
 __all__ = ["CRITERIA", "Redesign", "Step", "force_weight", "redesign"]
@@ -40,7 +40,7 @@ def redesign(
     design: Design,
     *,
     sample_time: float | None = None,
-    impulse_at: Where | None = None,
+    impulse_at: Location | None = None,
     test: LoopTest | None = None,
     draws: int = 200,
     seed: int = 0,

@@ -37,7 +37,7 @@ class Patch(NamedTuple):
     height: float
 
 
-Where = Place | Between | Patch
+Location = Place | Between | Patch
 Derivative = int | tuple[int, int]
 
 
@@ -45,7 +45,7 @@ class PlaceError(ValueError):
     """A place that a structure does not have, or a direction that it does not have there."""
 
 
-def position(place: Where) -> float:
+def position(place: Location) -> float:
     """A place as a position along an interval, m.
 
     Raises:
@@ -114,11 +114,11 @@ class Interval:
         """Gauss-Legendre points (n,), m, and weights (n,), m: ∫ f dx = Σ w f."""
         return gauss_between(np.array([0.0, self.length]), n)
 
-    def separation(self, one: Where, other: Where) -> float:
+    def separation(self, one: Location, other: Location) -> float:
         """Distance between two places over the length."""
         return abs(float(one) - float(other)) / self.length  # type: ignore[arg-type]
 
-    def text(self, place: Where, digits: int = 3) -> str:
+    def text(self, place: Location, digits: int = 3) -> str:
         """Text of a place, such as "x = 3.4"."""
         if isinstance(place, Between):
             return f"between {self.text(place.first, digits)} and {self.text(place.second, digits)}"
@@ -253,11 +253,11 @@ class Rectangle:
         x, y = np.meshgrid(0.5 * a * (points + 1.0), 0.5 * b * (points + 1.0), indexing="ij")
         return np.column_stack([x.ravel(), y.ravel()]), 0.25 * a * b * np.outer(weights, weights).ravel()
 
-    def separation(self, one: Where, other: Where) -> float:
+    def separation(self, one: Location, other: Location) -> float:
         """Distance between two places over the diagonal."""
         return float(np.hypot(one[0] - other[0], one[1] - other[1])) / self.size  # type: ignore
 
-    def text(self, place: Where, digits: int = 3) -> str:
+    def text(self, place: Location, digits: int = 3) -> str:
         """Text of a place, such as "(x, y) = (0.63, 0.72)"."""
         if isinstance(place, Between):
             return f"between {self.text(place.first, digits)} and {self.text(place.second, digits)}"
@@ -428,11 +428,11 @@ class NamedPoints:
         """
         raise PlaceError("named points have no shapes between them to integrate; describe the structure as a member")
 
-    def separation(self, one: Where, other: Where) -> float:
+    def separation(self, one: Location, other: Location) -> float:
         """0 for the same place and 1 for another, as named points have no common coordinate."""
         return float(_unordered(one) != _unordered(other))
 
-    def text(self, place: Where, digits: int = 3) -> str:
+    def text(self, place: Location, digits: int = 3) -> str:
         """Text of a place: its name; `digits` is not used."""
         if isinstance(place, Between):
             return f"between {place.first} and {place.second}"
@@ -442,8 +442,8 @@ class NamedPoints:
 Domain = Interval | Rectangle | NamedPoints
 
 
-@lru_cache(maxsize=1024)  # a search makes a rig for every prediction, mostly with the same ports
-def check_place(domain: Domain, where: Where, derivative: int = 0, direction: str | None = None) -> None:
+@lru_cache(maxsize=1024)  # a search makes a rig for every prediction, mostly with the same transducers
+def check_place(domain: Domain, where: Location, derivative: int = 0, direction: str | None = None) -> None:
     """Refuse a place, a pair of places or a patch, or a direction, that a domain does not have, by a `PlaceError`."""
     if isinstance(where, Patch):
         if not isinstance(domain, Rectangle):
@@ -483,7 +483,7 @@ def same_place(place: Any) -> Any:
     raise PlaceError(f"a place is a position x, a pair (x, y), or the name of a point; got {place!r}")
 
 
-def place_array(places: Sequence[Where | None]) -> np.ndarray:
+def place_array(places: Sequence[Location | None]) -> np.ndarray:
     """Places of one kind as an array: (n_places,) m, (n_places, 2) m, or (n_places,) names.
 
     An unknown place is nan, or None among names; all are nan where places are of several kinds.
@@ -503,7 +503,7 @@ def listed(places: np.ndarray) -> list[Place]:
     return [tuple(place) if isinstance(place, list) else place for place in places.tolist()]
 
 
-def middle(where: Where) -> Place:
+def middle(where: Location) -> Place:
     """The middle of a patch or of the interval between two positions; a single place itself.
 
     Raises:
@@ -516,7 +516,7 @@ def middle(where: Where) -> Place:
     return where
 
 
-def centred_at(where: Where, at: Place) -> Where:
+def centred_at(where: Location, at: Place) -> Location:
     """The patch, or the interval between two positions, moved to have its middle at `at`; else `at` itself."""
     if isinstance(where, Patch):
         x, y = at  # type: ignore[misc, str-unpack]
@@ -527,7 +527,7 @@ def centred_at(where: Where, at: Place) -> Where:
     return at
 
 
-def reach(domain: Interval | Rectangle, where: Where) -> tuple[np.ndarray, np.ndarray]:
+def reach(domain: Interval | Rectangle, where: Location) -> tuple[np.ndarray, np.ndarray]:
     """Range of the middle of a place, patch or pair of positions within the domain: from and to (n_coordinates,), m."""
     half = np.zeros(len(domain.coordinates))
     if isinstance(where, Patch):
@@ -542,7 +542,7 @@ def _rounded(value: float, digits: int) -> str:
     return f"{value:.{max(digits, len(f'{abs(value):.0f}'))}g}"
 
 
-def _unordered(place: Where) -> Any:
+def _unordered(place: Location) -> Any:
     return frozenset(place) if isinstance(place, Between) else place
 
 

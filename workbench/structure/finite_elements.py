@@ -13,7 +13,7 @@ from scipy.sparse.linalg import ArpackError, LinearOperator, SuperLU, eigsh, spl
 
 from workbench.arrays import Floats
 from workbench.structure.damping import Damping, ModalDamping, ViscousDamping
-from workbench.structure.domain import ROTATIONS, Between, NamedPoints, Where
+from workbench.structure.domain import ROTATIONS, Between, Location, NamedPoints
 from workbench.structure.modes import Modes
 from workbench.structure.printed import Printed, counted
 from workbench.structure.supports import Attachment, PointDamper, PointMass, PointSpring
@@ -187,7 +187,7 @@ class FiniteElements(Printed):
             damping=damping,
         )
 
-    def _row(self, where: Where) -> np.ndarray:
+    def _row(self, where: Location) -> np.ndarray:
         """(k, 2) degrees of freedom and factors of the elongation of an attachment."""
         if isinstance(where, Between):
             first, second = self.nodes.locate(list(where))

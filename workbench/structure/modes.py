@@ -15,11 +15,11 @@ from workbench.structure.domain import (
     Derivative,
     Domain,
     Interval,
+    Location,
     NamedPoints,
     Patch,
     PlaceError,
     Rectangle,
-    Where,
     as_domain,
     position,
 )
@@ -181,7 +181,7 @@ class Modes(Printed):
         values = np.asarray(self.shapes(self.domain.locate(places), derivative), float)
         return values if sign == 1.0 else sign * values
 
-    def phi_at(self, where: Where, derivative: Derivative = 0, *, direction: str | None = None) -> Floats:
+    def phi_at(self, where: Location, derivative: Derivative = 0, *, direction: str | None = None) -> Floats:
         """Mode shapes (n_modes,) at a place, their difference between two, or ∮ ∂φ/∂n ds of a patch."""
         if isinstance(where, Between):
             first, second = (self.phi(place, derivative, direction=direction)[0] for place in where)
@@ -221,7 +221,7 @@ class Modes(Printed):
             total += np.einsum("pk,pkr->pr", weights, slopes)
         return total
 
-    def is_held(self, where: Where, derivative: Derivative = 0, *, direction: str | None = None) -> bool:
+    def is_held(self, where: Location, derivative: Derivative = 0, *, direction: str | None = None) -> bool:
         """Whether a support holds the displacement, or the slope, of every mode at a place at zero."""
         if isinstance(self.domain, Interval) and not isinstance(where, Between):
             slack = 1e-9 * self.domain.length

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from workbench.structure.domain import Where, same_place
+from workbench.structure.domain import Location, same_place
 
 HELD = np.inf
 
@@ -92,7 +92,7 @@ def as_edges(edges: str | Edge | Mapping[str, str | Edge], *, allowed: tuple[str
 class AtPlace:
     """A part at a place, or between two; the place is stored in the form of `same_place`."""
 
-    at: Where
+    at: Location
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "at", same_place(self.at))

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from workbench.cases.case import Case
-from workbench.identification.driven import Driven, identify_driven
+from workbench.identification.driven import DrivenModes, identify_driven
 from workbench.identification.rig_from import rig_from
 from workbench.records.files import read_record
 from workbench.records.record import Record
@@ -71,7 +71,7 @@ def measured_case(
     return Case(nominal.stem, rig, read_all[: len(records)], read_all[len(records) :])
 
 
-def _rig_of(identified: Driven, driving_point: tuple[str, str] | None) -> Rig:
+def _rig_of(identified: DrivenModes, driving_point: tuple[str, str] | None) -> Rig:
     """The rig of identified modes; a warning that they have no scale names the option that gives one."""
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")

@@ -15,10 +15,10 @@ from workbench.draw.gap import plot_gaps, plot_responses, units_of_inputs
 from workbench.draw.identification import plot_deviations, plot_mac, stabilisation_diagram
 from workbench.draw.motion import mode_motion
 from workbench.draw.placement import plot_places
-from workbench.draw.signals import frequency_response, plot_coherence, plot_spectra, plot_transfer
+from workbench.draw.signals import frequency_response, plot_coherence, plot_frf_matrix, plot_spectra
 from workbench.identification.free_decay.ibrahim import stabilise, stable_modes
+from workbench.records.frequency_responses import FrequencyResponses
 from workbench.records.record import Record
-from workbench.records.transfer_functions import TransferFunctions
 from workbench.records.units import Units
 from workbench.structure.domain import place_array, same_place
 from workbench.structure.modes import SampledModes, mac
@@ -373,11 +373,11 @@ KINDS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
 
 def identification_page(
     report: IdentificationReport,
-    measured: Sequence[Record | TransferFunctions],
+    measured: Sequence[Record | FrequencyResponses],
     *,
     made_by: str,
 ) -> PageContent:
-    """The page of an identification report and its data; transfer functions are shown over the fitted band."""
+    """The page of an identification report and its data; FRFs are shown over the fitted band."""
     content = identified({**report.content, "heading": report.heading, "lines": list(report.lines)})
     blocks = [*content.pop("blocks"), *_stabilisation(report), *_response(measured, report.fitted)]
     return PageContent(title="Identified modes", blocks=blocks, made_by=made_by, **content)
@@ -397,16 +397,16 @@ def _stabilisation(report: IdentificationReport) -> list[dict[str, Any]]:
     return [block(figure, STABLE)]
 
 
-def _response(every: Sequence[Record | TransferFunctions], fitted: TransferFunctions | None) -> list[dict[str, Any]]:
+def _response(every: Sequence[Record | FrequencyResponses], fitted: FrequencyResponses | None) -> list[dict[str, Any]]:
     measured, why_not = every[0], ""
-    if isinstance(measured, TransferFunctions):
+    if isinstance(measured, FrequencyResponses):
         if fitted is not None:
             kept = np.isin(measured.frequencies_hz, fitted.frequencies_hz)
             measured = replace(measured, values=measured.values[..., kept], frequencies_hz=fitted.frequencies_hz)
-        return [block(plot_transfer(measured, fitted), "Transfer functions, measured and fitted (dashed).")]
+        return [block(plot_frf_matrix(measured, fitted), "FRFs, measured and fitted (dashed).")]
     if measured.n_inputs == 1 and np.ptp(measured.inputs) and fitted is not None:
         names = measured.output_names[:MOST_SENSORS]
-        beside = plot_transfer(frequency_response(measured).select_outputs(names), fitted.select_outputs(names))
+        beside = plot_frf_matrix(frequency_response(measured).select_outputs(names), fitted.select_outputs(names))
         left_out = measured.output_names[MOST_SENSORS:]
         rest = f" Not drawn: {', '.join(left_out)}." if left_out else ""
         measured_by = "Frequency response, measured by Welch's method, whose windows blunt sharp peaks"

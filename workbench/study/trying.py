@@ -64,7 +64,7 @@ class Design:
 
 
 @dataclass(frozen=True, eq=False)
-class Tried:
+class DesignResult:
     """The results of a design.
 
     Attributes:
@@ -179,7 +179,7 @@ def _share(rig: Rig, share: float) -> Place:
     return (share * domain.length[0], share * domain.length[1])
 
 
-def try_out(rig: Rig, design: Design) -> Tried:
+def try_out(rig: Rig, design: Design) -> DesignResult:
     """Design the law, close the loop through the sensors' modal filters, and simulate the response to the impulse.
 
     Raises:
@@ -212,7 +212,7 @@ def try_out(rig: Rig, design: Design) -> Tried:
     at_rest[modes.n_modes + design.controlled :] = 0.0  # so that W_r is the energy that control adds to the mode
     response = initial_response(loop, np.linspace(0.0, design.final_time, N_TIMES), state)
     effort = float(simpson((response.forces**2).sum(axis=0), x=response.time))
-    return Tried(law, loop, response, finite_spillover(loop, at_rest, design.final_time), effort)
+    return DesignResult(law, loop, response, finite_spillover(loop, at_rest, design.final_time), effort)
 
 
 def _instability(modes: Modes, law: Law, through: ModalFilter | None, fastest: float) -> str:

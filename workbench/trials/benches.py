@@ -9,7 +9,7 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.cases.case import Case
 from workbench.rig.rig import Rig
-from workbench.structure.domain import NamedPoints, Rectangle, Where
+from workbench.structure.domain import Location, NamedPoints, Rectangle
 from workbench.structure.member import Structure
 from workbench.trials.finite_elements import Frame
 from workbench.trials.plant import ModalMotion, Plant, SolvedPlant, coloured_noise
@@ -195,12 +195,12 @@ class Scene:
         """Names of the actuators that follow commands."""
         return [a.name for a in self.rig.actuators if not a.direct]
 
-    def motion_at(self, where: Where) -> tuple[np.ndarray, np.ndarray]:
+    def motion_at(self, where: Location) -> tuple[np.ndarray, np.ndarray]:
         """Nominal displacement and velocity at a place, or between two, (n_samples,) each."""
         shape = self.rig.modes.phi_at(where)
         return self.moved[0] @ shape, self.moved[1] @ shape
 
-    def place(self, rng: np.random.Generator, *, between: bool = False) -> Where:
+    def place(self, rng: np.random.Generator, *, between: bool = False) -> Location:
         """A random place whose rms motion is at least a third of the largest.
 
         Args:
@@ -223,7 +223,7 @@ class Scene:
             return round(float(x), 4), round(float(y), 4)
         return round(float(at) - float(rng.uniform(0.0, 0.01)) * domain.size, 4)
 
-    def _distinct(self, rng: np.random.Generator, between: bool) -> Where:
+    def _distinct(self, rng: np.random.Generator, between: bool) -> Location:
         """A random named point, or pair of points, whose modal force vector is not nearly parallel to another one.
 
         A force at a place with a parallel vector (weighted by the modal velocities) and another strength explains the
@@ -238,7 +238,7 @@ class Scene:
         ends = np.array([[index[str(pair.first)], index[str(pair.second)]] for pair in pairs]).reshape(-1, 2)
         felt = np.vstack([at_points, at_points[ends[:, 0]] - at_points[ends[:, 1]]])
         size = np.linalg.norm(felt, axis=1)
-        places: list[Where] = [*alone, *pairs]
+        places: list[Location] = [*alone, *pairs]
         wanted = np.arange(size.size) >= len(alone) if between else np.arange(size.size) < len(alone)
         lively = np.flatnonzero(wanted & (size > size[wanted].max() / 3))
         unit = felt / np.maximum(size, 1e-300)[:, None]

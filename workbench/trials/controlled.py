@@ -14,7 +14,7 @@ RUN_AWAY = 1e6  # times the energy that the impulse gives
 
 
 @dataclass(frozen=True, eq=False)
-class Controlled:
+class PlantResponse:
     """The response of a plant under a controller.
 
     Attributes:
@@ -69,7 +69,7 @@ def control_plant(
     impulse_input: str,
     impulse: float = 1.0,
     rng: np.random.Generator | None = None,
-) -> Controlled:
+) -> PlantResponse:
     """The response of the plant to an impulse at one of its inputs, under control.
 
     Args:
@@ -105,7 +105,7 @@ def control_plant(
         commands = np.zeros(m)
         commands[commanded], followed, z = controller.step(z, followed, outputs[:, k])
         motion.interval(k, state, system, real.drive, pieces, commands, held[k], moved[k], sums)
-    return Controlled(energy, sums.work, float(sums.squares.sum()), float(sums.peaks.max()), bounded, dt, outputs)
+    return PlantResponse(energy, sums.work, float(sums.squares.sum()), float(sums.peaks.max()), bounded, dt, outputs)
 
 
 class _Reading:

@@ -13,11 +13,11 @@ import numpy as np
 
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
-from workbench.structure.domain import Between, Interval, NamedPoints, Rectangle, Where, middle
+from workbench.structure.domain import Between, Interval, Location, NamedPoints, Rectangle, middle
 from workbench.structure.member import Beam, Structure
 from workbench.structure.supports import HELD
 from workbench.trials.benches import Scene, Unsuitable
-from workbench.trials.finite_elements import Buckled
+from workbench.trials.finite_elements import BucklingError
 from workbench.trials.hidden import hide
 from workbench.trials.laws import POINT_LAWS, PointSizes, Strengths
 
@@ -52,7 +52,7 @@ def _typical_stiffness(scene: Scene) -> float:
     return float(modes.omega[first] ** 2 / np.max(shape**2))
 
 
-def _place(where: Where) -> Numbers:
+def _place(where: Location) -> Numbers:
     """A place in the case format."""
     if isinstance(where, Between):
         return {"between": list(where)}
@@ -202,16 +202,21 @@ def _sensor_crosstalk(scene: Scene, rng: np.random.Generator) -> OfStrength:
 def _moved(side: str, scene: Scene, rng: np.random.Generator) -> Numbers:
     """The draw of a misplaced actuator (side "input") or sensor ("output")."""
     rig, domain = scene.rig, scene.rig.modes.domain
-    ports: Sequence[Actuator | Sensor] = rig.sensors if side == "output" else [a for a in rig.actuators if not a.direct]
-    port = ports[int(rng.integers(len(ports)))]
+    transducers: Sequence[Actuator | Sensor] = (
+        rig.sensors if side == "output" else [a for a in rig.actuators if not a.direct]
+    )
+    transducer = transducers[int(rng.integers(len(transducers)))]
     if isinstance(domain, NamedPoints):
         if domain.positions is None:
-            return {side: port.name, "at": str(rng.choice([name for name in domain.names if name != port.at]))}
+            return {
+                side: transducer.name,
+                "at": str(rng.choice([name for name in domain.names if name != transducer.at])),
+            }
         at = scene.place(rng)
-        if at == port.at:
+        if at == transducer.at:
             raise Unsuitable("the actuator or sensor would stay at its place")
-        return {side: port.name, "at": at}
-    lengths, stated = np.atleast_1d(domain.length), np.atleast_1d(np.asarray(middle(port.at), float))
+        return {side: transducer.name, "at": at}
+    lengths, stated = np.atleast_1d(domain.length), np.atleast_1d(np.asarray(middle(transducer.at), float))
     if isinstance(domain, Rectangle):
         angle = float(rng.uniform(0.0, 2.0 * np.pi))
         direction = np.array([np.cos(angle), np.sin(angle)])
@@ -221,7 +226,7 @@ def _moved(side: str, scene: Scene, rng: np.random.Generator) -> Numbers:
     for moved in (stated + step, stated - step):
         if ((0.02 * lengths < moved) & (moved < lengths)).all():
             place = np.round(moved, 4).tolist()
-            return {side: port.name, "at": place if isinstance(domain, Rectangle) else place[0]}
+            return {side: transducer.name, "at": place if isinstance(domain, Rectangle) else place[0]}
     raise Unsuitable("the actuator or sensor would leave the structure")
 
 
@@ -370,5 +375,5 @@ def draw_effect(kind: str, scene: Scene, rng: np.random.Generator) -> dict[str, 
 def _gap(effect: dict[str, Any], scene: Scene, rng: np.random.Generator) -> float:
     try:
         return scene.gap(hide(scene.bench.plant(), [effect]), rng)
-    except (Unsuitable, Buckled):
+    except (Unsuitable, BucklingError):
         return 1e3

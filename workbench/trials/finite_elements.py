@@ -15,7 +15,7 @@ from skfem import Basis, BilinearForm, ElementLineHermite, ElementLineP2, Functi
 from skfem.helpers import d, dd
 
 from workbench.arrays import Floats
-from workbench.structure.domain import Between, Domain, NamedPoints, Where, position
+from workbench.structure.domain import Between, Domain, Location, NamedPoints, position
 from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Bar, Beam, Structure
 from workbench.structure.modes import Modes, freeze
@@ -27,7 +27,7 @@ APART = 1e-4
 NEGLIGIBLE = 1e-9  # likewise of a bar, whose elements may be as short as they like
 
 
-class Buckled(ValueError):
+class BucklingError(ValueError):
     """An altered structure that buckles."""
 
 
@@ -88,7 +88,7 @@ def element_modes(
         places: (n_places,) of the shapes returned, m.
 
     Raises:
-        Buckled: the member buckles.
+        BucklingError: the member buckles.
     """
     beam = isinstance(member, Beam)
     special = [*places, *(a for a, _ in (*altered.masses, *altered.springs))]
@@ -120,7 +120,7 @@ def element_modes(
     values = np.array(energy) + np.einsum("ir,ir->r", full, beside @ full)
     omega2 = np.where(np.abs(values) < 1e-6 * abs(shift), 0.0, values)
     if (omega2 < 0).any():
-        raise Buckled("the altered member is unstable: it buckles; draw a weaker compression")
+        raise BucklingError("the altered member is unstable: it buckles; draw a weaker compression")
     nearest = np.array([_node(nodes, x) for x in places], int)
     at_places = full[displacement[nearest]]
     if beam:
@@ -129,7 +129,7 @@ def element_modes(
 
 
 def matrix_modes(
-    frame: FiniteElements, places: Sequence[Where], n_modes: int, *, altered: Alterations = AS_NOMINAL
+    frame: FiniteElements, places: Sequence[Location], n_modes: int, *, altered: Alterations = AS_NOMINAL
 ) -> ElementModes:
     """The lowest modes of altered matrices, K v = ω² M v, all degrees of freedom at once.
 
@@ -142,14 +142,14 @@ def matrix_modes(
     points = frame.nodes
     rows = np.eye(len(points.names))
 
-    def row(where: Where) -> Floats:
+    def row(where: Location) -> Floats:
         first, *second = points.locate(list(where) if isinstance(where, Between) else where)
         return np.asarray(rows[first] - rows[second].sum(axis=0))
 
     return _dense_modes(frame.stiffness.toarray(), frame.mass.toarray(), points, row, places, n_modes, altered)
 
 
-def modal_modes(nominal: Modes, places: Sequence[Where], *, altered: Alterations = AS_NOMINAL) -> ElementModes:
+def modal_modes(nominal: Modes, places: Sequence[Location], *, altered: Alterations = AS_NOMINAL) -> ElementModes:
     """The modes of altered modal data, in the basis of the nominal modes.
 
     (Ω² f + Σ k φ φᵀ) v = ω² (I + Σ m φ φᵀ) v; a mass acts in every direction of its node.
@@ -165,8 +165,8 @@ def _dense_modes(
     stiffness: Floats,
     mass: Floats,
     domain: Domain,
-    row: Callable[[Where], Floats],
-    places: Sequence[Where],
+    row: Callable[[Location], Floats],
+    places: Sequence[Location],
     n_modes: int,
     altered: Alterations,
 ) -> ElementModes:

@@ -34,22 +34,24 @@ def _law(law: PointLaw, plant: Plant, e: dict[str, Any]) -> Plant:
     return replace(plant, laws=(*plant.laws, (law.code, place_of(e), tuple(e[name] for name in law.parameters))))
 
 
-def _with_ports(plant: Plant, side: str, name: str, **changes: Any) -> Plant:
+def _with_transducers(plant: Plant, side: str, name: str, **changes: Any) -> Plant:
     """The plant with one actuator or sensor changed, or all of them (except hammers) for the name "all"."""
 
-    def meant(port: Actuator | Sensor) -> bool:
-        return port.name == name or (name == "all" and not getattr(port, "direct", False))
+    def meant(transducer: Actuator | Sensor) -> bool:
+        return transducer.name == name or (name == "all" and not getattr(transducer, "direct", False))
 
-    ports: Any = tuple(replace(port, **changes) if meant(port) else port for port in getattr(plant, side))
-    return replace(plant, **{side: ports})
+    transducers: Any = tuple(
+        replace(transducer, **changes) if meant(transducer) else transducer for transducer in getattr(plant, side)
+    )
+    return replace(plant, **{side: transducers})
 
 
-def _port(side: str, key: str, **fields: str) -> Hide:
+def _transducer(side: str, key: str, **fields: str) -> Hide:
     """A change of fields of an actuator or sensor, each to the parameter of this name."""
-    return lambda plant, e: _with_ports(plant, side, e[key], **{f: e[name] for f, name in fields.items()})
+    return lambda plant, e: _with_transducers(plant, side, e[key], **{f: e[name] for f, name in fields.items()})
 
 
-_actuator, _sensor = partial(_port, "actuators", "input"), partial(_port, "sensors", "output")
+_actuator, _sensor = partial(_transducer, "actuators", "input"), partial(_transducer, "sensors", "output")
 
 
 def _support(plant: Plant, e: dict[str, Any]) -> Plant:
@@ -60,20 +62,20 @@ def _support(plant: Plant, e: dict[str, Any]) -> Plant:
 
 def _moved(side: str, key: str, plant: Plant, e: dict[str, Any]) -> Plant:
     """The plant with one actuator or sensor moved; a patch keeps its size."""
-    (stood,) = (port.at for port in getattr(plant, side) if port.name == e[key])
-    return _with_ports(plant, side, e[key], at=centred_at(stood, place_of(e)))
+    (stood,) = (transducer.at for transducer in getattr(plant, side) if transducer.name == e[key])
+    return _with_transducers(plant, side, e[key], at=centred_at(stood, place_of(e)))
 
 
 def _swapped(side: str, key: str, plant: Plant, e: dict[str, Any]) -> Plant:
     """The plant with the cables of two actuators or sensors swapped; a channel keeps its name, noise and rounding."""
-    by_name = {port.name: port for port in getattr(plant, side)}
+    by_name = {transducer.name: transducer for transducer in getattr(plant, side)}
     pair = {e[key]: by_name[e["with"]], e["with"]: by_name[e[key]]}
     kept = ("name", "noise_std", "step") if side == "sensors" else ("name",)
-    ports: Any = tuple(
-        replace(pair[name], **{field: getattr(port, field) for field in kept}) if name in pair else port
-        for name, port in by_name.items()
+    transducers: Any = tuple(
+        replace(pair[name], **{field: getattr(transducer, field) for field in kept}) if name in pair else transducer
+        for name, transducer in by_name.items()
     )
-    return replace(plant, **{side: ports})
+    return replace(plant, **{side: transducers})
 
 
 def _actuator_crosstalk(plant: Plant, e: dict[str, Any]) -> Plant:

@@ -8,7 +8,7 @@ import numpy as np
 
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
-from workbench.structure.domain import Interval, NamedPoints, Rectangle, Where, centred_at, middle, reach
+from workbench.structure.domain import Interval, Location, NamedPoints, Rectangle, centred_at, middle, reach
 from workbench.trials.benches import Bench
 from workbench.trials.plant import Plant
 
@@ -67,7 +67,7 @@ def with_imperfections(plant: Plant, name: str, size: float, bench: Bench, rng: 
 
 def _with_part(plant: Plant, name: str, size: float, bench: Bench, rng: np.random.Generator) -> Plant:
     actuators, sensors, domain = plant.actuators, plant.sensors, bench.rig.modes.domain
-    ports: tuple[Actuator | Sensor, ...] = (*actuators, *sensors)
+    transducers: tuple[Actuator | Sensor, ...] = (*actuators, *sensors)
     n = len(actuators)
     if name == "shape":
         spread = rng.uniform(-1.0, 1.0, bench.rig.modes.n_modes) * DAMPING_SPREAD * size
@@ -90,11 +90,11 @@ def _with_part(plant: Plant, name: str, size: float, bench: Bench, rng: np.rando
         interpolated = bool(rng.random() < 0.5)
         return replace(plant, sensors=_each(sensors, delay=delays, interpolated=[interpolated] * len(sensors)))
     if name == "gain":
-        errors = np.exp(CALIBRATION * size * rng.standard_normal(len(ports)))
-        gains = [port.gain * float(error) for port, error in zip(ports, errors, strict=True)]
+        errors = np.exp(CALIBRATION * size * rng.standard_normal(len(transducers)))
+        gains = [transducer.gain * float(error) for transducer, error in zip(transducers, errors, strict=True)]
         return replace(plant, actuators=_each(actuators, gain=gains[:n]), sensors=_each(sensors, gain=gains[n:]))
     if name == "place" and not isinstance(domain, NamedPoints):
-        places = _off_places(domain, [port.at for port in ports], PLACED * size, rng)
+        places = _off_places(domain, [transducer.at for transducer in transducers], PLACED * size, rng)
         return replace(
             plant,
             actuators=_each(actuators, at=places[:n]),
@@ -103,17 +103,20 @@ def _with_part(plant: Plant, name: str, size: float, bench: Bench, rng: np.rando
     return plant
 
 
-def _each(ports: Any, **values: list[Any]) -> Any:
+def _each(transducers: Any, **values: list[Any]) -> Any:
     """The actuators or sensors with a value of each field for each of them."""
-    return tuple(replace(port, **{name: each[i] for name, each in values.items()}) for i, port in enumerate(ports))
+    return tuple(
+        replace(transducer, **{name: each[i] for name, each in values.items()})
+        for i, transducer in enumerate(transducers)
+    )
 
 
 def _off_places(
-    domain: Interval | Rectangle, stated: Sequence[Where], size: float, rng: np.random.Generator
-) -> list[Where]:
+    domain: Interval | Rectangle, stated: Sequence[Location], size: float, rng: np.random.Generator
+) -> list[Location]:
     """Places with random errors, m, limited to stay on the structure."""
     drawn = size * domain.size * rng.standard_normal((len(stated), len(domain.coordinates)))
-    places: list[Where] = []
+    places: list[Location] = []
     for where, by in zip(stated, drawn, strict=True):
         centre = np.asarray(middle(where), float)
         at = np.atleast_1d(centre) + np.clip(by, *(np.array(reach(domain, where)) - centre))

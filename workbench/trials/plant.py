@@ -12,7 +12,7 @@ from workbench.arrays import Floats
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
-from workbench.structure.domain import Where
+from workbench.structure.domain import Location
 from workbench.structure.member import Structure
 from workbench.structure.plate import Plate
 from workbench.trials import motion
@@ -62,12 +62,12 @@ class Plant:
     altered: Alterations = field(default_factory=Alterations)
     damping_factor: float = 1.0
     damping_factors: tuple[float, ...] = ()
-    laws: tuple[tuple[int, Where, tuple[float, ...]], ...] = ()
+    laws: tuple[tuple[int, Location, tuple[float, ...]], ...] = ()
     drag: float = 0.0
     stretching: float = 0.0
     stiffness_rate: float = 0.0
-    tones: tuple[tuple[Where, float, float, float], ...] = ()
-    noises: tuple[tuple[Where, float, float], ...] = ()
+    tones: tuple[tuple[Location, float, float, float], ...] = ()
+    noises: tuple[tuple[Location, float, float], ...] = ()
     mix: np.ndarray | None = None
     curvature: np.ndarray | None = None
     crosstalk: tuple[tuple[str, str, float], ...] = ()

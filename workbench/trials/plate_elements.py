@@ -18,7 +18,7 @@ from workbench.arrays import Floats
 from workbench.structure.domain import Patch, gauss_between
 from workbench.structure.plate import Plate
 from workbench.structure.supports import HELD
-from workbench.trials.finite_elements import AS_NOMINAL, Alterations, Buckled, ElementModes, waves
+from workbench.trials.finite_elements import AS_NOMINAL, Alterations, BucklingError, ElementModes, waves
 
 ELEMENTS = 60  # along the longer side
 CROWDED = 0.7  # grading of the mesh towards the edges, for the singular corner of a clamped and a free edge; below 1
@@ -41,7 +41,7 @@ def plate_modes(
 
     Raises:
         ValueError: a plate with varying properties, tension or attachments; alterations that only a member can have.
-        Buckled: the plate buckles.
+        BucklingError: the plate buckles.
     """
     constant = plate.mass_per_area.is_constant and plate.bending_stiffness.is_constant
     if not constant or any(plate.tension) or plate.attachments:
@@ -83,7 +83,7 @@ def plate_modes(
     order = np.argsort(values)
     omega2 = np.where(np.abs(values[order]) < ROUNDED * abs(shift), 0.0, values[order])
     if (omega2 < 0).any():
-        raise Buckled("the altered plate is unstable: it buckles; draw a weaker spring")
+        raise BucklingError("the altered plate is unstable: it buckles; draw a weaker spring")
     full = np.zeros((x.size * y.size, n_modes))
     full[kept] = vectors[:, order] / np.sqrt(np.sum(vectors * (mass @ vectors), axis=0))[order]
     shapes = np.array([_row(x, y, at) @ full for at in places]).reshape(-1, n_modes)

@@ -142,7 +142,7 @@ def test_what_is_read_is_what_the_sensors_read(rig):
         DT, names, tuple(a.name for a in mute.actuators), shaken.A, shaken.B * 0.0, c, d, np.zeros((2, n + 2))
     )
     forces = np.random.default_rng(0).normal(size=(1, 300)).cumsum(axis=1)
-    test = LoopTest(300, DT, forces=forces, ports=rig.actuators[:1])
+    test = LoopTest(300, DT, forces=forces, exciters=rig.actuators[:1])
     told = run_loop(mute, telling, test, substeps=16).commands[2:]
     expected = simulate(replace(real, actuators=rig.actuators[:1]), forces, sample_time=DT).outputs
     for j in range(n):
@@ -206,7 +206,7 @@ def test_what_does_not_fit_is_named(rig):
     with pytest.raises(ValueError, match="give both the same"):
         run_loop(rig, one, LoopTest(10, 2 * DT))
     with pytest.raises(ValueError, match="Is time last"):
-        LoopTest(10, DT, forces=np.zeros((10, 1)), ports=rig.actuators[:1])
+        LoopTest(10, DT, forces=np.zeros((10, 1)), exciters=rig.actuators[:1])
 
 
 def test_the_linear_part_is_pythons_control(rig):
@@ -223,7 +223,7 @@ def test_the_linear_part_is_pythons_control(rig):
 
 def test_a_test_and_its_run_cannot_be_written_to(rig):
     forces = np.zeros((1, 10))
-    test = LoopTest(10, DT, forces=forces, ports=(Actuator("h", 0.8, direct=True),))
+    test = LoopTest(10, DT, forces=forces, exciters=(Actuator("h", 0.8, direct=True),))
     forces[:] = 9.0
     assert not test.forces.any()
     run = run_loop(rig, restless(rig), test)

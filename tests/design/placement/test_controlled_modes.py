@@ -36,7 +36,7 @@ def test_the_least_number_is_recommended():
     assert result.recommended == 2 and result.residual[0] > 0.05 * result.energy.sum()
     assert controlled_mode_count(found, state, weight=20.0, share=1e-9).recommended is None
     # the nodes of mode 13, at which 12 actuators would stand, are not known
-    assert np.isnan(controlled_mode_count(found, state, weight=20.0, most=12).effort[11])
+    assert np.isnan(controlled_mode_count(found, state, weight=20.0, max_modes=12).effort[11])
 
 
 def test_refusals():

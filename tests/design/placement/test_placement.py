@@ -219,7 +219,7 @@ def test_a_choice_among_named_points_is_certified_without_a_limit(frame_task):
     assert best.placement.residual_work == place_actuators(frame_task, Limits()).residual_work
 
 
-def test_limits_on_peak_force_condition_and_stretches_are_kept(task):
+def test_limits_on_peak_force_condition_and_intervals_are_kept(task):
     limits = Limits(effort=0.4, peak_force=0.34, condition=6.0, spacing=0.5, forbidden=((2.5, 3.4), (7.0, 9.0)))
     best = place_actuators(task, limits, starts=6)
     assert best.peak_force <= 0.34 * (1 + 1e-5) and best.condition <= 6.0 * (1 + 1e-5)

@@ -25,8 +25,8 @@ def design(modes, **options):
     return on_off(modes, 4, places, **{"force": 0.02, "dead_band": 0.01, **options})
 
 
-def end_state(relay, stretches):
-    last = stretches[-1]
+def end_state(relay, segments):
+    last = segments[-1]
     pattern = last.steady, last.ramp, last.fading, relay.slope
     return np.array(travel(relay.omega, relay.damping, last.end - last.start, last.displacement, last.rate, *pattern))
 
@@ -45,11 +45,11 @@ def sampled(relay, q, v, final, step):
 def test_without_a_dead_band_each_half_swing_loses_two_k_over_omega_squared():
     """f = -k sgn(q') on an undamped mode is dry friction: the swing falls by 2k/ω² each half period, then sticks."""
     relay = Relay(omega=2.0, damping=0.0, force=0.4, dead_band=0.0)
-    stretches = switch(relay, 1.05, 0.0, 20.0)
-    turning = np.array([s.displacement for s in stretches])
+    segments = switch(relay, 1.05, 0.0, 20.0)
+    turning = np.array([s.displacement for s in segments])
     np.testing.assert_allclose(np.abs(turning), [1.05, 0.85, 0.65, 0.45, 0.25, 0.05], atol=1e-12)
-    np.testing.assert_allclose([s.start for s in stretches], np.arange(6) * np.pi / 2, rtol=1e-13)
-    assert [s.sliding for s in stretches] == [False] * 5 + [True]
+    np.testing.assert_allclose([s.start for s in segments], np.arange(6) * np.pi / 2, rtol=1e-13)
+    assert [s.sliding for s in segments] == [False] * 5 + [True]
 
 
 def test_a_double_integrator_switches_where_the_parabola_says():
@@ -82,13 +82,13 @@ def test_a_relay_sampled_ever_faster_tends_to_the_exact_motion(relay, start):
 def test_the_edge_is_slid_along_exactly_and_left_where_the_spring_no_longer_pushes():
     """With q < 0 and q' = d the spring drives the mode out and the force back in, until q = 0: q' = d all the while."""
     relay = Relay(1.0, 0.0, 2.0, 0.05)
-    stretches = switch(relay, -1.0, 0.5, 40.0)
-    slide = next(s for s in stretches if s.sliding)
-    left = stretches[stretches.index(slide) + 1]
+    segments = switch(relay, -1.0, 0.5, 40.0)
+    slide = next(s for s in segments if s.sliding)
+    left = segments[segments.index(slide) + 1]
     assert left.displacement == pytest.approx(0.0, abs=1e-13) and left.rate == pytest.approx(0.05, rel=1e-13)
     assert left.start - slide.start == pytest.approx(-slide.displacement / 0.05, rel=1e-12)
     # then it swings inside the dead band, touching its edges for ever without a further switching
-    assert left is stretches[-1] and left.end == 40.0
+    assert left is segments[-1] and left.end == 40.0
 
 
 def test_finer_instants_change_nothing():

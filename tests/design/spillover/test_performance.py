@@ -76,13 +76,13 @@ def test_a_loop_that_is_unstable_has_no_figures():
         performance(close_loop(MODES, LAW), STATE, weight=1.0, final_time=np.inf)
 
 
-def test_effort_of_a_relay_is_that_of_its_stretches_over_a_long_time():
+def test_effort_of_a_relay_is_that_of_its_segments_over_a_long_time():
     relay = on_off(MODES, 1, ACTUATORS[:1], force=0.002, dead_band=0.01)
     told = on_off_performance(MODES, relay, STATE, weight=3.0, final_time=4000.0)
-    (stretches,) = respond_on_off(MODES, relay, STATE, [0.0, 4000.0]).stretches
-    each = [(s.end - s.start, s.steady, s.ramp) for s in stretches]
+    (segments,) = respond_on_off(MODES, relay, STATE, [0.0, 4000.0]).segments
+    each = [(s.end - s.start, s.steady, s.ramp) for s in segments]
     squared = sum(force**2 * t + force * ramp * t**2 + ramp**2 * t**3 / 3.0 for t, force, ramp in each)
-    assert len(stretches) > 20 and not any(s.fading for s in stretches)
+    assert len(segments) > 20 and not any(s.fading for s in segments)
     assert told.effort == pytest.approx(squared / MODES.phi(3.0)[0, 0] ** 2, rel=1e-9)
 
 

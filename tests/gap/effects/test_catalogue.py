@@ -19,7 +19,7 @@ from workbench.gap.effects.effect import (
 )
 from workbench.gap.effects.environment import _is_distortion
 from workbench.gap.effects.nonlinear import POWER_DAMPER, POWER_SPRING, in_catalogue
-from workbench.gap.effects.ports import clipped_level, exchanged_last
+from workbench.gap.effects.transducers import clipped_level, exchanged_last
 from workbench.gap.report.verdict import _described, effect_json
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
@@ -261,7 +261,7 @@ def test_exchanged_channels_are_named_by_both():
         ("sensor_quantisation", "d", {"step": 0.05}),
     ],
 )
-def test_effects_are_told_of_the_port_itself_where_wires_are_exchanged(kind, channel, values):
+def test_effects_are_told_of_the_transducer_itself_where_wires_are_exchanged(kind, channel, values):
     """The same model either way: a gain of the channel after the exchange is one of the actuator before it."""
     nominal, side = rig(), "inputs" if kind.startswith("actuator") else "outputs"
     pair = ("F1", "F2") if side == "inputs" else ("d", "d2")
@@ -312,7 +312,7 @@ def test_cross_talk_stays_with_the_channel_where_inputs_are_exchanged(swapped_fi
     np.testing.assert_allclose(found.outputs, expected.outputs, atol=1e-12)
 
 
-def _evidence(real: Rig, inputs: np.ndarray) -> SimpleNamespace:
+def _reconstruction(real: Rig, inputs: np.ndarray) -> SimpleNamespace:
     """What is left of a record of a real rig by the nominal one."""
     nominal = rig()
     seen, expected = (simulate(r, inputs, sample_time=DT) for r in (real, nominal))
@@ -323,13 +323,13 @@ def _evidence(real: Rig, inputs: np.ndarray) -> SimpleNamespace:
 def test_cross_talk_of_actuators_starts_where_the_residual_shows_it():
     kind, gain = kind_named("actuator_crosstalk"), kind_named("actuator_gain")
     leaking = kind.apply(rig(), ("F1", "F2"), {"share": -0.3})
-    (start,) = kind.starts(_evidence(leaking, drive()), ("F1", "F2"))
+    (start,) = kind.starts(_reconstruction(leaking, drive()), ("F1", "F2"))
     assert start["share"] == pytest.approx(-0.3)
     wrong = gain.apply(rig(), "F1", {"gain": 1.2})
-    assert list(kind.starts(_evidence(wrong, drive(6000)), ("F1", "F2"))) == []
+    assert list(kind.starts(_reconstruction(wrong, drive(6000)), ("F1", "F2"))) == []
     alike = drive()
     alike[1] = -0.7 * alike[0]  # the share is then a gain
-    assert list(kind.starts(_evidence(leaking, alike), ("F1", "F2"))) == []
+    assert list(kind.starts(_reconstruction(leaking, alike), ("F1", "F2"))) == []
 
 
 def test_a_number_whose_deviation_exceeds_it_does_not_stand_out():

@@ -88,8 +88,8 @@ def test_a_fault_of_a_sensor_on_a_motion_that_is_known_leaves_the_same_errors(hi
     wrong = Effect(kind_named("sensor_gain"), rig.sensors[0].name, {"gain": 1.2}).apply(late)
     records = tuple(replace(record_of(rig, rng.normal(size=(1, 300)), rng), name=name) for name in ("one", "other"))
     noise = np.array([sensor.noise_std for sensor in rig.sensors])
-    for settle in (0.0, 0.4):
-        ahead = FitData(records, noise, settle=settle).one_step_ahead(rig)
+    for transient in (0.0, 0.4):
+        ahead = FitData(records, noise, transient=transient).one_step_ahead(rig)
         known = [ahead.residual(each) for each in (late, wrong, late)]
         for each, residual in zip((late, wrong, late), known, strict=True):
             np.testing.assert_array_equal(residual, replace(ahead).residual(each))

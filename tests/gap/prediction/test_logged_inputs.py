@@ -20,7 +20,7 @@ from workbench.gap.prediction.unmodelled_force import log_likelihood, whiten
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import CubicSpring
 from workbench.rig.rig import shape_of
-from workbench.rig.simulate import predict, simulate
+from workbench.rig.simulate import simulate, simulate_record
 
 NOISE = 1e-5
 SHARE = 0.005
@@ -87,7 +87,7 @@ def test_its_power_is_that_of_draws(rig, logged):
     rng = np.random.default_rng(5)
     expected, loudest = logging_noise_power(rig, logged), loudest_logging_noise(rig, logged)
     for i, record in enumerate(logged.counted):
-        answers = (predict(rig, replace(record, inputs=noise_of_inputs(record, rng))) for _ in range(200))
+        answers = (simulate_record(rig, replace(record, inputs=noise_of_inputs(record, rng))) for _ in range(200))
         powers = np.array([((answer / NOISE) ** 2).mean(axis=1) for answer in answers])
         error = powers.std(axis=0) / np.sqrt(len(powers))
         assert (np.abs(powers.mean(axis=0) - expected[i]) < 4.0 * error).all() and (error < 0.1 * expected[i]).all()

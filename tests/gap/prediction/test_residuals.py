@@ -28,7 +28,7 @@ def at_two_rates(hinged_rig):
 
 def test_each_record_leaves_out_as_many_seconds(at_two_rates):
     rig, (fast, slow) = at_two_rates
-    data = FitData((fast, slow), np.full(4, 1e-5), settle=2.0)
+    data = FitData((fast, slow), np.full(4, 1e-5), transient=2.0)
     assert [r.time[0] for r in data.counted] == pytest.approx([2.0, 2.0])
     assert data.residual(rig).size == data.n_values == 4 * (800 + 200)
     powers = power_of_inputs(rig, (fast, slow), 2.0)
@@ -39,7 +39,7 @@ def test_the_order_of_records_of_two_rates_changes_no_verdict(at_two_rates):
     rig, records = at_two_rates
     catalogue = tuple(kind_named(n) for n in ("sensor_gain", "modal_damping"))
     for order in (records, records[::-1]):
-        verdict = diagnose(rig, order, catalogue=catalogue, settle=6.0, workers=1)
+        verdict = diagnose(rig, order, catalogue=catalogue, transient=6.0, workers=1)
         assert verdict.outcome == "explained"
         assert verdict.effects[0].values["gain"] == pytest.approx(1.1, abs=1e-3)
 

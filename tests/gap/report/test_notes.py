@@ -58,9 +58,9 @@ def test_what_no_input_drives_is_as_large_at_every_level(rig, shaken, levels, hi
 
 def test_blocks_are_of_what_is_compared_once_settled(rig, shaken):
     """The last tenth of each record has as many blocks as a whole one, so that its remark has a standard error."""
-    assert "does not grow" in steady_remainder(rig, shaken((1.0, 4.0), hidden=1.0), settle=36.0)
+    assert "does not grow" in steady_remainder(rig, shaken((1.0, 4.0), hidden=1.0), transient=36.0)
     late = replace(rig, actuators=(replace(LOGGED, gain=1.2),))
-    low, high = measure(rig, late, shaken((1.0,), hidden=1.0, gain=1.2), settle=36.0).ci95
+    low, high = measure(rig, late, shaken((1.0,), hidden=1.0, gain=1.2), transient=36.0).ci95
     assert low < high
 
 

@@ -63,7 +63,7 @@ def test_a_late_sensor_is_an_effect_unless_others_are_late_too(search, others, m
     assert may_be_small_error(late, errors, search) == may_be
 
 
-def test_the_port_that_errors_move_and_scale_is_suspected(search):
+def test_the_transducer_that_errors_move_and_scale_is_suspected(search):
     """An actuator 4 cm off its place and a gain of 0.97; errors of 2 mm and 1 % belong to any test."""
     values = {"place_of_F2_at": 0.02, "place_of_F1_at": 0.001, "gain_at_d1": np.log(0.97), "gain_of_F1": 0.01}
     errors = nominal_errors(search.rig, NominalPrior(place=0.01, gain=0.01, sample_time=SAMPLE_TIME))

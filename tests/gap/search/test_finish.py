@@ -163,17 +163,17 @@ def test_any_number_of_sets_may_explain_the_records_as_well(rig, search, monkeyp
     gain = kind_named("actuator_gain")
     here = fit(one.rig, (Effect(gain, "F", {"gain": 1.0}),), one.data)
     others = [(Effect(kind_named("sensor_gain"), f"{k}", {"gain": 1.0}),) for k in range(8)]
-    monkeypatch.setattr(finish, "_at_other_ports", lambda *_: others)
+    monkeypatch.setattr(finish, "_at_other_transducers", lambda *_: others)
     monkeypatch.setattr(finish, "fit", lambda _, effects, __: replace(here, effects=effects))
     found = with_equals(one, here, (), None, ())
     assert len(found) == 8
     assert [p for _, p in found] == pytest.approx([1.0 / 9.0] * 8)
 
 
-def test_sets_at_other_ports_come_in_the_order_of_their_likeness(rig, search):
+def test_sets_at_other_transducers_come_in_the_order_of_their_likeness(rig, search):
     """In a set of names it was another in every run."""
     sensors = [sensor.name for sensor in reversed(rig.sensors)]
     best = SimpleNamespace(effects=(Effect(kind_named("actuator_gain"), "F", {"gain": 1.0}),))
     alike = [("actuator_gain[F]", f"sensor_gain[{name}]", 1.0) for name in sensors]
-    found = finish._at_other_ports(search(rig), best, None, alike)
+    found = finish._at_other_transducers(search(rig), best, None, alike)
     assert [effect.target for (effect,) in found] == sensors

@@ -59,8 +59,8 @@ def test_a_gain_is_known_no_better_than_calibrations_and_is_relative_to_that_of_
     """
     rig = hinged_rig(n_modes=2)
     rig = replace(rig, actuators=(replace(rig.actuators[0], gain=2e-3),), sensors=rig.sensors[:1])
-    port = rig.actuators[0] if kind == "actuator_gain" else rig.sensors[0]
-    gain = Effect(kind_named(kind), port.name, {"gain": 1.8})
+    transducer = rig.actuators[0] if kind == "actuator_gain" else rig.sensors[0]
+    gain = Effect(kind_named(kind), transducer.name, {"gain": 1.8})
     real = apply_all(rig, (gain,))
     assert [p.gain for p in (*real.actuators, *real.sensors)] == pytest.approx(
         [3.6e-3, 1.0] if kind == "actuator_gain" else [2e-3, 1.8]
@@ -72,14 +72,14 @@ def test_a_gain_is_known_no_better_than_calibrations_and_is_relative_to_that_of_
     found = fit(rig, (start, nominal_errors(rig, NominalPrior(gain=learnt))), data)
     told = with_intervals(rig, found, data).effects[0]
     assert told.values["gain"] == pytest.approx(1.8, rel=1e-3)
-    assert told.std["gain"] == pytest.approx(1.8 * 0.01 * np.sqrt(2.0), rel=0.05)  # of both ports
+    assert told.std["gain"] == pytest.approx(1.8 * 0.01 * np.sqrt(2.0), rel=0.05)  # of both transducers
 
 
-def test_a_law_is_known_no_better_than_the_scale_of_the_shapes_at_all_ports(hinged_rig):
-    """Errors of the shapes at all ports, of standard deviation s: records show their product of input and output alone.
+def test_a_law_is_known_no_better_than_the_scale_of_the_shapes_at_all_transducers(hinged_rig):
+    """Errors of the shapes at all transducers, of standard deviation s: records show the product of input and output.
 
     Motion (1 + x) times as large, with an input 1 + x times as strong and readings 1 - x times, has the same readings
-    if the stiffness of a cubic spring falls by 2 x; the priors of p ports and m modes know x to s / √(p m).
+    if the stiffness of a cubic spring falls by 2 x; the priors of p transducers and m modes know x to s / √(p m).
     """
     rig, stiffness, size = hinged_rig(n_modes=2), 4000.0, 0.05
     law = Effect(kind_named("cubic_spring"), None, {"at": 0.62, "stiffness": stiffness})
@@ -88,8 +88,8 @@ def test_a_law_is_known_no_better_than_the_scale_of_the_shapes_at_all_ports(hing
     data = FitData((record,), 1e-5 * record.outputs.std(axis=1))
     found = fit(rig, (law, nominal_errors(rig, NominalPrior(shape=size))), data)
     told = with_intervals(rig, found, data).effects[0]
-    ports, modes = len(rig.actuators) + len(rig.sensors), rig.modes.n_modes
-    assert told.std["stiffness"] == pytest.approx(2.0 * stiffness * size / np.sqrt(ports * modes), rel=0.05)
+    transducers, modes = len(rig.actuators) + len(rig.sensors), rig.modes.n_modes
+    assert told.std["stiffness"] == pytest.approx(2.0 * stiffness * size / np.sqrt(transducers * modes), rel=0.05)
 
 
 @pytest.mark.slow
@@ -147,7 +147,7 @@ def test_a_place_where_the_structure_moves_most_is_known_by_the_square_of_the_di
 def test_a_spring_is_known_no_better_than_the_mode_shapes_where_it_stands():
     """Of k φ φᵀ no record shows the factor c of k / c² and c φ: of 1 % of two modes each, k has 2 % / √2 at least.
 
-    It stands where there is no port. A careful model's shapes may be off by 2.5 %, where the records do not tell.
+    It stands where there is no transducer. A careful model's shapes may be off by 2.5 %, where the records do not tell.
     """
     points, rng = NamedPoints(("a", "b", "c")), np.random.default_rng(3)
     nominal = np.array([[1.0, 0.8], [0.7, -0.9], [0.9, 0.6]])

@@ -23,7 +23,7 @@ from workbench.gap.search.fit import Fit, fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.jointly import fit_jointly, size_of, surely_late, with_all_errors
 from workbench.gap.search.plain import (
-    _at_ports,
+    _at_transducers,
     few_with_uniform_errors,
     in_place_of_nominal_errors,
     other_delay_causes,
@@ -79,7 +79,7 @@ def test_a_damper_stands_in_place_of_the_damping_of_every_mode(search):
 
 
 def test_a_gain_beside_common_errors_is_known_no_better_than_calibrations(search):
-    """Of a model that is a little off no port is calibrated exactly, be it an actuator or one of four sensors.
+    """Of a model that is a little off no transducer is calibrated exactly, be it an actuator or one of four sensors.
 
     Three ratios of these five gains are told to be 1, and make 1 % of each s² = (2 + 0 * 3) / (2 + 3) of its square.
     """
@@ -146,7 +146,7 @@ def test_a_damper_is_found_beside_sensors_that_stand_and_read_a_little_otherwise
         (MODULUS, False),
     ],
 )
-def test_what_a_careful_model_may_be_off_by_at_a_port(search, effect, may):
+def test_what_a_careful_model_may_be_off_by_at_a_transducer(search, effect, may):
     assert is_plausible_error(effect, search(())) == may
 
 
@@ -170,7 +170,7 @@ def test_strong_effects_are_found_one_by_one_beside_common_errors(search):
     assert found["modulus_error"].values["factor"] == pytest.approx(1.008, abs=0.001)
 
 
-def test_what_a_careful_model_may_have_at_a_port_is_not_taken_for_one_of_few(search):
+def test_what_a_careful_model_may_have_at_a_transducer_is_not_taken_for_one_of_few(search):
     slight = Effect(kind_named("sensor_gain"), "d3", {"gain": 1.03})
     one = replace(search((slight,)), catalogue=(slight.kind,))
     assert few_with_uniform_errors(one, beside_errors(one), 4) is None
@@ -229,7 +229,7 @@ def test_one_sensor_late_alone_is_an_effect(hinged_rig, late, alone):
 def test_a_sensor_on_the_late_side_of_jumps_stays_there_by_a_trifle(hinged_rig):
     late = NominalPrior(delay=1e-6, gain=0.01, late=("d1",), sample_time=0.01)
     errors = nominal_errors(hinged_rig(n_modes=4), late, {"delay_d1": 1e-4})
-    sides = [surely_late(kept).target for (kept,) in _at_ports(errors)]
+    sides = [surely_late(kept).target for (kept,) in _at_transducers(errors)]
     assert sides and all(side.delay == late.delay and not side.late for side in sides)
 
 

@@ -10,14 +10,14 @@ from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Effect, can_be, nearest_possible
 from workbench.gap.effects.nominal import NominalPrior, nominal_errors
 from workbench.gap.effects.structural import buckling_load
-from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.localisation.force_reconstruction import ForceReconstruction
 from workbench.gap.prediction.innovations import Observer
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.report.budget import RUNAWAY, residual_powers
 from workbench.gap.search.fit import Fit, fit, slopes
 from workbench.gap.search.jointly import fit_from_zero
-from workbench.gap.search.pairs import Pairs, _evidence_with
+from workbench.gap.search.pairs import Pairs, _reconstruction_with
 from workbench.gap.search.screening import Screening, _starts, fitted_ahead, one_more
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import SELECTION
@@ -59,7 +59,7 @@ def test_a_load_that_only_a_stiffer_beam_bears_ends_no_search(rig, search):
     (weaker,) = nearest_possible(rig, (load,))
     assert can_be(rig, (weaker,)) and -1.0 < weaker.values["tension"] / buckling_load(rig) < -0.9
     assert nearest_possible(rig, (load,), (errors,))[0].values == load.values
-    assert _starts(replace(search, held=(errors,)), (load,), Evidence.of(rig, search.data))
+    assert _starts(replace(search, held=(errors,)), (load,), ForceReconstruction.of(rig, search.data))
     assert list(residual_powers(rig, (load,), search.data.records[:1], 0.0)) == [RUNAWAY]
     linear = replace(search, data=search.first.stepped(1), quick=search.first.stepped(1), by_mode=True)
     assert np.isfinite(fit_from_zero(Stepwise(linear).search, (load,)).fit.cost)
@@ -85,8 +85,8 @@ def test_what_two_effects_come_to_is_least_squares_within_bounds():
 
 
 def test_both_halves_of_a_pair_are_found_at_once(rig, search):
-    evidence = Evidence.of(rig, search.data)
-    best = fitted_ahead(search, Screening.of(search, (), evidence).likeliest_pairs(SELECTION.tried))[0]
+    reconstruction = ForceReconstruction.of(rig, search.data)
+    best = fitted_ahead(search, Screening.of(search, (), reconstruction).likeliest_pairs(SELECTION.tried))[0]
     named = {effect.label: effect.values for effect in best.effects}
     assert set(named) == {"cubic_spring", "sensor_gain[d3]"} and best.cost < 1.05
     assert named["cubic_spring"]["at"] == pytest.approx(0.62, abs=1e-3)
@@ -96,12 +96,12 @@ def test_both_halves_of_a_pair_are_found_at_once(rig, search):
 @pytest.mark.slow
 def test_what_the_numbers_of_a_given_effect_make_up_for_is_no_move(rig, search):
     given = (Effect(kind_named("cubic_spring"), None, {"at": 0.62, "stiffness": 2000.0}),)
-    evidence = Evidence.of(given[0].apply(rig), search.data, 20)
-    found = Screening.of(search, given, evidence)
+    reconstruction = ForceReconstruction.of(given[0].apply(rig), search.data, 20)
+    found = Screening.of(search, given, reconstruction)
     along = slopes(rig, given, search.first_ahead)[1]
     assert np.abs(found.left @ along).max() < 1e-6 * np.linalg.norm(found.left) * np.linalg.norm(along)
     assert found.likeliest()[0].label == "sensor_gain[d3]"
-    best = one_more(search, given, evidence, found)[0]
+    best = one_more(search, given, reconstruction, found)[0]
     assert best.labels == ("cubic_spring", "sensor_gain[d3]") and best.cost < 1.05
     assert best.effects[0].values["stiffness"] == pytest.approx(3000.0, rel=1e-2)
 
@@ -143,9 +143,9 @@ def test_a_sensor_that_rounds_coarsely_is_not_heard_beside_a_random_force(search
 def test_a_force_is_sought_beside_no_motion_that_runs_away(rig, search):
     """A spring that pushes away is told by predictions one sample ahead; whole records of it alone are none."""
     softening = Effect(kind_named("cubic_spring"), None, {"at": 0.62, "stiffness": -3e5})
-    assert _evidence_with(search, softening).rig is rig
+    assert _reconstruction_with(search, softening).rig is rig
     hardening = replace(softening, values={"at": 0.62, "stiffness": 2000.0})
-    assert _evidence_with(search, hardening).rig.elements
+    assert _reconstruction_with(search, hardening).rig.elements
 
 
 @pytest.mark.slow

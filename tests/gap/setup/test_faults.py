@@ -15,7 +15,7 @@ from workbench.gap.setup.records import check_disjoint
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
-from workbench.rig.simulate import predict
+from workbench.rig.simulate import simulate_record
 from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import NamedPoints
 from workbench.structure.finite_elements import FiniteElements
@@ -71,7 +71,7 @@ def test_nothing_is_wrong_with_a_case_wired_rightly(case):
 def test_a_case_wired_rightly_is_simulated_once_a_record(case, monkeypatch):
     simulated = []
     monkeypatch.setattr(
-        comparison, "predict", lambda rig, record: simulated.append(record.name) or predict(rig, record)
+        comparison, "simulate_record", lambda rig, record: simulated.append(record.name) or simulate_record(rig, record)
     )
     assert setup_faults(case.rig, case.fit, case.validation) == ()
     assert simulated == [record.name for record in (*case.fit, *case.validation)]
@@ -268,8 +268,8 @@ def test_the_set_up_is_compared_once_the_rig_has_settled(case):
     """Records that begin in motion look like no wiring at first."""
     crossed = change(case.fit, outputs=exchanged(7, 1, 4))
     begun = [r.between(0.2 * r.n_samples * r.sample_time) for r in crossed]
-    settle = 0.5 * begun[0].n_samples * begun[0].sample_time
-    assert [fault.sentence for fault in setup_faults(case.rig, begun, settle=settle)] == [
+    transient = 0.5 * begun[0].n_samples * begun[0].sample_time
+    assert [fault.sentence for fault in setup_faults(case.rig, begun, transient=transient)] == [
         "The outputs a2 and a5 are exchanged: swap them."
     ]
 

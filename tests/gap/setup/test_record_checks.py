@@ -7,7 +7,7 @@ import pytest
 
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Kind
-from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.localisation.force_reconstruction import ForceReconstruction
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.report.experiment import detectability
 from workbench.gap.setup.record_checks import RecordsError, check_modes, check_records
@@ -34,7 +34,7 @@ def data(rig, record_of):
 
 
 def test_only_the_actuator_at_rest_hides_its_faults(rig, data):
-    found = detectability(Evidence.of(rig, data))
+    found = detectability(ForceReconstruction.of(rig, data))
     assert found.undetectable
     assert all(label.startswith("actuator_") and "[F2]" in label for label in found.undetectable)
     assert "actuator_gain[F2]" in found.undetectable and found.strengths["actuator_gain[F2]"] == 0.0
@@ -45,18 +45,20 @@ def test_a_weak_start_hides_nothing_and_what_does_nothing_stays_hidden(rig, data
     modulus = vars(kind_named("modulus_error", CATALOGUE))
     weak = Kind(**{**modulus, "starts": lambda *_: [{"factor": 1.0 + 1e-12}, {"factor": 1.1}]})
     idle = Kind(**{**modulus, "name": "idle", "apply": lambda rig, *_: rig})
-    assert detectability(Evidence.of(rig, data), catalogue=(weak, idle)).undetectable == ("idle",)
+    assert detectability(ForceReconstruction.of(rig, data), catalogue=(weak, idle)).undetectable == ("idle",)
 
 
 def test_a_force_that_noise_puts_by_a_support_hides_no_effect(rig, data):
-    found = detectability(Evidence.of(rig, data).of_force_at(1e-4 * rig.modes.length))
+    found = detectability(ForceReconstruction.of(rig, data).of_force_at(1e-4 * rig.modes.length))
     assert found.undetectable and all("[F2]" in label for label in found.undetectable)
 
 
 def test_two_effects_that_do_the_same_are_told_to_be_alike(rig, data):
     gain = kind_named("actuator_gain", CATALOGUE)
     twin = Kind(**{**vars(gain), "name": "another_gain"})
-    found = detectability(Evidence.of(rig, data), catalogue=(gain, twin, kind_named("modulus_error", CATALOGUE)))
+    found = detectability(
+        ForceReconstruction.of(rig, data), catalogue=(gain, twin, kind_named("modulus_error", CATALOGUE))
+    )
     assert found.indistinguishable == (("actuator_gain[F1]", "another_gain[F1]", pytest.approx(1.0)),)
 
 
@@ -111,8 +113,8 @@ def test_a_rig_without_actuators_and_a_record_of_few_samples_are_refused(rig, da
     free = replace(rig, actuators=())
     with pytest.raises(RecordsError, match="no actuators"):
         check_records(free, [free.record(np.zeros((0, 1000)), record.outputs, sample_time=0.01, name="free")])
-    with pytest.raises(RecordsError, match="has 10 samples to compare once settled; at least 16 are needed"):
-        check_records(rig, [record], settle=9.9)
+    with pytest.raises(RecordsError, match="has 10 samples to compare after transients; at least 16 are needed"):
+        check_records(rig, [record], transient=9.9)
 
 
 def test_a_strong_force_that_nobody_modelled_is_no_wrong_unit(rig, record_of):

@@ -37,8 +37,8 @@ def test_sound_records_have_none(rig, measured):
 def test_a_record_that_begins_in_motion(rig, measured):
     record = measured(rig)
     (said,) = data_faults(rig, [record.between(2.3)])
-    assert "'high' does not start from rest" in said and "settle" in said
-    assert data_faults(rig, [record.between(2.3)], settle=5.0) == ()
+    assert "'high' does not start from rest" in said and "transient" in said
+    assert data_faults(rig, [record.between(2.3)], transient=5.0) == ()
     biased = altered(record, lambda y: np.add(y[1], 1.0, out=y[1]))
     assert data_faults(rig, [biased]) == (), "a constant offset is a bias"
 

@@ -42,8 +42,8 @@ def test_duffing_oscillator_follows_its_backbone():
 def test_one_stretch_compares_nothing():
     truth = SampledModes([9.0], [0.01], [[1.0]], [0.0])
     record = free_decay(truth, sample_time=0.02, n_samples=300, noise_std=0.02)
-    with pytest.raises(ValueError, match="two stretches or more"):
-        amplitude_dependence(record, refine(record, truth), stretches=1)
+    with pytest.raises(ValueError, match="two segments or more"):
+        amplitude_dependence(record, refine(record, truth), segments=1)
 
 
 def test_the_comparison_ends_with_the_time():

@@ -43,16 +43,16 @@ def exact(hertz):
 def test_the_responses_to_two_independent_inputs_are_those_of_the_model():
     u = np.random.default_rng(0).standard_normal((2, 400_000)) * np.array([[1.0], [3.0]])
     found = frequency_responses([record(u)])
-    truth = exact(found.transfer.frequencies_hz)
-    assert np.abs(found.transfer.values - truth).max() < 0.03 * np.abs(truth).max()
+    truth = exact(found.frf.frequencies_hz)
+    assert np.abs(found.frf.values - truth).max() < 0.03 * np.abs(truth).max()
     assert found.coherence.min() > 0.99 and found.units == ("N", "N") and not found.silent
 
 
 def test_partly_correlated_inputs_are_told_apart_where_h1_of_each_alone_would_mix_them():
     v = np.random.default_rng(1).standard_normal((2, 400_000))
     found = frequency_responses([record(np.array([v[0], 0.7 * v[0] + 0.7 * v[1]]))])
-    truth = exact(found.transfer.frequencies_hz)
-    assert np.abs(found.transfer.values - truth).max() < 0.05 * np.abs(truth).max()
+    truth = exact(found.frf.frequencies_hz)
+    assert np.abs(found.frf.values - truth).max() < 0.05 * np.abs(truth).max()
 
 
 def test_the_multiple_coherence_is_the_share_of_power_that_the_inputs_explain():
@@ -60,7 +60,7 @@ def test_the_multiple_coherence_is_the_share_of_power_that_the_inputs_explain():
     u, level = np.random.default_rng(2).standard_normal((2, 400_000)), 0.3
     clean = record(u)
     found = frequency_responses([record(u, noise=level)])
-    explained = (np.abs(exact(found.transfer.frequencies_hz)) ** 2).sum(axis=1)  # of inputs of unit variance
+    explained = (np.abs(exact(found.frf.frequencies_hz)) ** 2).sum(axis=1)  # of inputs of unit variance
     share = explained / (explained + level**2 * clean.outputs.std() ** 2)
     assert np.abs(found.coherence - share).mean() < 0.02
     assert found.coherence.min() >= 0.0 and found.coherence.max() <= 1.0
@@ -85,10 +85,10 @@ def test_an_input_that_is_the_sum_of_two_others_is_named():
 def test_two_records_of_one_shaker_each_give_the_responses_to_both():
     u = np.random.default_rng(5).standard_normal((2, 100_000))
     first, second = (record(np.where(np.arange(2)[:, None] == i, u, 0.0)) for i in range(2))
-    truth = exact((found := frequency_responses([first, second])).transfer.frequencies_hz)
-    assert np.abs(found.transfer.values - truth).max() < 0.05 * np.abs(truth).max()
+    truth = exact((found := frequency_responses([first, second])).frf.frequencies_hz)
+    assert np.abs(found.frf.values - truth).max() < 0.05 * np.abs(truth).max()
     alone = frequency_responses([first])
-    assert alone.silent == ("F2",) and alone.transfer.references == ("F1",)
+    assert alone.silent == ("F2",) and alone.frf.references == ("F1",)
     with pytest.raises(ValueError, match="every input is constant"):
         frequency_responses([replace(first, inputs=np.zeros((2, 100_000)))])
 
@@ -109,7 +109,7 @@ def test_lines_that_the_inputs_hardly_excite_show_no_response_to_noise():
     numerator, denominator = cheby2(10, 70.0, 0.5)
     u = lfilter(numerator, denominator, np.random.default_rng(4).standard_normal((2, 100_000)))
     found = frequency_responses([record(u, noise=0.05)])
-    hertz, shown = found.transfer.frequencies_hz, np.isfinite(found.transfer.values).all(axis=(0, 1))
+    hertz, shown = found.frf.frequencies_hz, np.isfinite(found.frf.values).all(axis=(0, 1))
     assert shown[hertz < 12.0].all() and not shown[hertz > 26.0].any()
     assert np.isnan(found.coherence[:, hertz > 26.0]).all()
-    assert np.isfinite(frequency_responses([record(u)]).transfer.values).all(), "without noise all are coherent"
+    assert np.isfinite(frequency_responses([record(u)]).frf.values).all(), "without noise all are coherent"

@@ -1,12 +1,12 @@
-"""Poles that distortion of a stronger mode makes, by closed forms and in the transfer function of a cubic spring."""
+"""Poles that distortion of a stronger mode makes, by closed forms and in the FRF of a cubic spring."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from workbench.identification.frf import identify_frf
 from workbench.identification.signal.harmonics import overtone_remarks
-from workbench.identification.transfer import identify_transfer
 from workbench.records.record import Channel
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import CubicSpring
@@ -50,7 +50,7 @@ def test_what_is_hardly_known_may_be_one():
     assert len(said_of(beside, deviation=np.array([0, 0, 0.2 + 0.4j]))) == 1
 
 
-def test_the_transfer_function_of_a_cubic_spring_has_the_third_harmonic_and_says_so(hinged_beam):
+def test_the_frf_of_a_cubic_spring_has_the_third_harmonic_and_says_so(hinged_beam):
     """A blow, and a spring of a tenth of the first mode's restoring force at its largest."""
     rng = np.random.default_rng(0)
     drive, sensor = Actuator("F", 0.225 * hinged_beam.length), Sensor("d", 0.35 * hinged_beam.length)
@@ -67,8 +67,8 @@ def test_the_transfer_function_of_a_cubic_spring_has_the_third_harmonic_and_says
     read = read + 1e-4 * largest * rng.normal(size=read.shape)
     lines = np.fft.rfftfreq(n, dt)
     inside = (lines > 0.1 * f1) & (lines < 18.0 * f1)
-    transfer = np.fft.rfft(read)[:, inside] / np.fft.rfft(blow)[:, inside]
-    found = identify_transfer(transfer, lines[inside], channels=(Channel("d", "displacement"),))
+    frf = np.fft.rfft(read)[:, inside] / np.fft.rfft(blow)[:, inside]
+    found = identify_frf(frf, lines[inside], channels=(Channel("d", "displacement"),))
     third = np.argmin(np.abs(found.modes.frequencies_hz - 3.0 * found.modes.frequencies_hz[0]))
     assert found.modes.frequencies_hz[third] == pytest.approx(3.0 * found.modes.frequencies_hz[0], rel=0.02)
     assert "lies at 3 × mode 1" in " ".join(found.remarks)

@@ -11,26 +11,28 @@ from numpy.typing import ArrayLike
 from workbench.design.laws.law import DesignError
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.closed_loop import Response, checked_times
-from workbench.design.loop.switching import Stretch, switch, travel
+from workbench.design.loop.switching import Segment, switch, travel
+from workbench.renamed import Renamed
 from workbench.rig.actuators import Actuator
 from workbench.rig.statespace import input_matrix
 from workbench.structure.modes import Modes
 
 
 @dataclass(frozen=True, eq=False)
-class Switched:
+class OnOffResponse:
     """A response under on-off control.
 
     Attributes:
         response: modal motion and forces.
-        stretches: of each controlled mode, its motion between switchings.
+        segments: of each controlled mode, its motion between switchings.
     """
 
     response: Response
-    stretches: tuple[tuple[Stretch, ...], ...]
+    segments: tuple[tuple[Segment, ...], ...]
+    stretches = Renamed("segments")
 
 
-def respond_on_off(modes: Modes, law: OnOffLaw, state: np.ndarray, time: ArrayLike) -> Switched:
+def respond_on_off(modes: Modes, law: OnOffLaw, state: np.ndarray, time: ArrayLike) -> OnOffResponse:
     """The response from a state (2 n_modes,) at t = 0, exact at each of the times (n_times,), however far apart.
 
     Raises:
@@ -38,11 +40,11 @@ def respond_on_off(modes: Modes, law: OnOffLaw, state: np.ndarray, time: ArrayLi
         ValueError: times that do not increase from zero or later.
     """
     time = checked_times(time)
-    stretches = switchings(modes, law, state, time[-1])
-    return Switched(motion(modes, law, state, time, stretches), stretches)
+    segments = switchings(modes, law, state, time[-1])
+    return OnOffResponse(motion(modes, law, state, time, segments), segments)
 
 
-def switchings(modes: Modes, law: OnOffLaw, state: np.ndarray, final_time: float) -> tuple[tuple[Stretch, ...], ...]:
+def switchings(modes: Modes, law: OnOffLaw, state: np.ndarray, final_time: float) -> tuple[tuple[Segment, ...], ...]:
     """The motion of each controlled mode between its switchings, up to the final time.
 
     Raises:
@@ -76,7 +78,7 @@ def _check_proportional(actuator: Actuator, largest: float) -> None:
 
 
 def motion(
-    modes: Modes, law: OnOffLaw, state: np.ndarray, time: np.ndarray, stretches: tuple[tuple[Stretch, ...], ...]
+    modes: Modes, law: OnOffLaw, state: np.ndarray, time: np.ndarray, segments: tuple[tuple[Segment, ...], ...]
 ) -> Response:
     """Modal motion and forces at the times (n_times,), from the motion between switchings."""
     n = modes.n_modes
@@ -89,19 +91,19 @@ def motion(
     position, rate = travel(omega, damping, time, state[residual][:, None], state[n:][residual][:, None], 0.0)
     for j, (relay, r) in enumerate(zip(law.relays, law.controlled, strict=True)):
         driven = np.zeros((2, len(residual), 1))
-        for stretch in stretches[j]:
-            inside = np.flatnonzero((time >= stretch.start) & (time < stretch.end))
-            if stretch is stretches[j][-1]:
-                inside = np.flatnonzero(time >= stretch.start)
-            tau = time[inside] - stretch.start
-            course = stretch.steady, stretch.ramp, stretch.fading, relay.slope
+        for segment in segments[j]:
+            inside = np.flatnonzero((time >= segment.start) & (time < segment.end))
+            if segment is segments[j][-1]:
+                inside = np.flatnonzero(time >= segment.start)
+            tau = time[inside] - segment.start
+            course = segment.steady, segment.ramp, segment.fading, relay.slope
             force[j, inside] = course[0] + course[1] * tau + course[2] * np.exp(-relay.slope * tau)
             modal[r, inside], modal[n + r, inside] = travel(
-                relay.omega, relay.damping, tau, stretch.displacement, stretch.rate, *course
+                relay.omega, relay.damping, tau, segment.displacement, segment.rate, *course
             )
             at = travel(omega, damping, tau, driven[0], driven[1], *course)
             position[:, inside] += coupling[:, [j]] * at[0]
             rate[:, inside] += coupling[:, [j]] * at[1]
-            driven = np.array(travel(omega, damping, stretch.end - stretch.start, driven[0], driven[1], *course))
+            driven = np.array(travel(omega, damping, segment.end - segment.start, driven[0], driven[1], *course))
     modal[residual], modal[[n + r for r in residual]] = position, rate
     return Response(time, modal, law.spread @ force, modes)

@@ -21,7 +21,7 @@ ILL_CONDITIONED = 1e10
 
 
 @dataclass(frozen=True, eq=False)
-class Reidentified:
+class OpenLoopEstimate:
     """Stiffness and damping of the controlled modes, without control.
 
     Attributes:
@@ -48,7 +48,7 @@ class Reidentified:
         return float(np.abs(off / np.outer(size, size)).max())
 
 
-def open_loop(modes: Modes, law: Law, poles: ArrayLike, shapes: ArrayLike) -> Reidentified:
+def open_loop(modes: Modes, law: Law, poles: ArrayLike, shapes: ArrayLike) -> OpenLoopEstimate:
     """The open-loop stiffness and damping from closed-loop poles and shapes.
 
     Args:
@@ -77,10 +77,10 @@ def open_loop(modes: Modes, law: Law, poles: ArrayLike, shapes: ArrayLike) -> Re
             " excite all modes"
         )
     solution = np.linalg.solve((left / scale).T, right.T).T / scale.T
-    return Reidentified(solution[:, :n], solution[:, n:])
+    return OpenLoopEstimate(solution[:, :n], solution[:, n:])
 
 
-def updated(modes: Modes, controlled: Sequence[int], found: Reidentified) -> Modes:
+def updated(modes: Modes, controlled: Sequence[int], found: OpenLoopEstimate) -> Modes:
     """The modes with the controlled ones' frequencies and damping as re-identified; all shapes stay."""
     index = list(controlled)
     omega, damping = modes.omega.copy(), modes.damping.copy()

@@ -11,12 +11,13 @@ from workbench.arguments import number, whole
 from workbench.design.estimation.digital import DigitalController
 from workbench.design.loop.closed_loop import Response
 from workbench.design.loop.loop_steps import ControllerArrays, loop_record
+from workbench.renamed import Renamed, former_arguments
 from workbench.rig.actuators import Actuator, mixing
 from workbench.rig.elements import PeriodicForce, RandomForce
 from workbench.rig.rig import Rig, participation_of, shape_of
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.stepping import law_arrays, structure_arrays
-from workbench.structure.domain import Where
+from workbench.structure.domain import Location
 from workbench.structure.modes import freeze
 from workbench.threads import cores
 
@@ -36,17 +37,18 @@ class LoopTest:
         impulse_at: the place of an impulse at t = 0; None for none.
         impulse: N s.
         forces: (n_forces, n_samples) N.
-        ports: (n_forces,) actuators whose place, kind and direction say how the forces act; the rest is not used.
+        exciters: (n_forces,) actuators whose place, kind and direction say how the forces act; the rest is not used.
         seed: of the sensors' noise and of random disturbances; None for neither.
     """
 
     n_samples: int
     sample_time: float
-    impulse_at: Where | None = None
+    impulse_at: Location | None = None
     impulse: float = 1.0
     forces: np.ndarray | None = None
-    ports: tuple[Actuator, ...] = ()
+    exciters: tuple[Actuator, ...] = ()
     seed: int | None = None
+    ports = Renamed("exciters")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "n_samples", whole(self.n_samples, "LoopTest.n_samples"))
@@ -54,9 +56,9 @@ class LoopTest:
             raise ValueError(
                 f"a test needs 2 samples or more, a positive time apart; got {self.n_samples}, {self.sample_time:g} s"
             )
-        if self.forces is not None and np.shape(self.forces) != (len(self.ports), self.n_samples):
+        if self.forces is not None and np.shape(self.forces) != (len(self.exciters), self.n_samples):
             raise ValueError(
-                f"LoopTest.forces must have shape ({len(self.ports)} ports, {self.n_samples} samples); got"
+                f"LoopTest.forces must have shape ({len(self.exciters)} exciters, {self.n_samples} samples); got"
                 f" {np.shape(self.forces)}. Is time last?"
             )
         if self.forces is not None:
@@ -65,6 +67,9 @@ class LoopTest:
     @property
     def time(self) -> np.ndarray:
         return self.sample_time * np.arange(self.n_samples)
+
+
+LoopTest.__init__ = former_arguments(ports="exciters")(LoopTest.__init__)  # type: ignore[method-assign]
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,7 +250,7 @@ def _output_matrices(rig: Rig, sensors: Sequence[Sensor]) -> np.ndarray:
 def _disturbances(rig: Rig, test: LoopTest, rng: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray]:
     """Forces (n_forces, n_samples) of the test and the rig's elements, and their participation (n_modes, n_forces)."""
     rows = [] if test.forces is None else list(test.forces)
-    columns = list(participation_of(Rig(rig.modes, test.ports, ())).T) if test.ports else []
+    columns = list(participation_of(Rig(rig.modes, test.exciters, ())).T) if test.exciters else []
     middle = test.time + 0.5 * test.sample_time
     for element in rig.elements:
         if isinstance(element, PeriodicForce):

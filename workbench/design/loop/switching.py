@@ -23,7 +23,7 @@ MOST_EVENTS = 1_000_000
 
 
 @dataclass(frozen=True)
-class Stretch:
+class Segment:
     """Motion between two events.
 
     Attributes:
@@ -43,12 +43,12 @@ class Stretch:
     sliding: bool = False
 
 
-def switch(relay: Relay, displacement: float, rate: float, final_time: float) -> tuple[Stretch, ...]:
-    """The motion from (q, q') at t = 0 up to the final time, as stretches between switchings."""
-    return tuple(_stretches(relay, float(displacement), float(rate), float(final_time)))
+def switch(relay: Relay, displacement: float, rate: float, final_time: float) -> tuple[Segment, ...]:
+    """The motion from (q, q') at t = 0 up to the final time, as segments between switchings."""
+    return tuple(_segments(relay, float(displacement), float(rate), float(final_time)))
 
 
-def _stretches(relay: Relay, q: float, v: float, final: float) -> Iterator[Stretch]:
+def _segments(relay: Relay, q: float, v: float, final: float) -> Iterator[Segment]:
     d, k, slope = relay.dead_band, relay.force, relay.slope
     s, time, edge = v + slope * q, 0.0, None
     if abs(abs(s) - d) <= TOUCH * max(abs(v) + abs(slope * q), d):
@@ -73,7 +73,7 @@ def _stretches(relay: Relay, q: float, v: float, final: float) -> Iterator[Stret
         levels = (-d, d) if sign == 0 else (sign * d,)
         duration, reached = _crossing(relay, q, v, force, levels, edge, final - time)
         end = final if reached is None else time + duration
-        yield Stretch(time, end, q, v, force)
+        yield Segment(time, end, q, v, force)
         if reached is None:
             return
         q = float(travel(relay.omega, relay.damping, duration, q, v, force)[0])
@@ -164,12 +164,12 @@ def _slide(relay: Relay, q: float, edge: float, low: float, high: float) -> tupl
     return best, reached
 
 
-def _sliding(relay: Relay, start: float, end: float, q: float, v: float, edge: float) -> Stretch:
+def _sliding(relay: Relay, start: float, end: float, q: float, v: float, edge: float) -> Segment:
     slope = relay.slope
     if slope == 0:
-        return Stretch(start, end, q, v, -_pull(relay, q, edge), relay.omega**2 * edge, 0.0, True)
+        return Segment(start, end, q, v, -_pull(relay, q, edge), relay.omega**2 * edge, 0.0, True)
     settled = -_pull(relay, edge / slope, edge)
-    return Stretch(start, end, q, v, settled, 0.0, -_pull(relay, q, edge) - settled, True)
+    return Segment(start, end, q, v, settled, 0.0, -_pull(relay, q, edge) - settled, True)
 
 
 # --- closed forms

@@ -293,13 +293,13 @@ class CellTree:
 
 
 def _of_interval(task: PlacementTask, limits: Limits) -> CellTree:
-    table, stretches = Intervals.of(task), limits.intervals(task.n_controlled, task.modes.length, task.reach[0])
+    table, intervals = Intervals.of(task), limits.intervals(task.n_controlled, task.modes.length, task.reach[0])
     low, high = table.centre - table.half, table.centre + table.half
-    allowed = np.any([(high >= first) & (low <= last) for first, last in stretches], axis=0)
+    allowed = np.any([(high >= first) & (low <= last) for first, last in intervals], axis=0)
 
     def places(cell: np.ndarray) -> np.ndarray | None:
         x: np.ndarray = table.centre[cell]
-        return x if free_places(task.modes.domain, x, stretches).all() else None
+        return x if free_places(task.modes.domain, x, intervals).all() else None
 
     return CellTree(table, low, high, limits.spacing, allowed, LEVELS, places)
 

@@ -16,7 +16,7 @@ from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError
 from workbench.design.placement.placement import nodes_of_mode
 from workbench.design.spillover.spillover import effort, spillover
-from workbench.renamed import Renamed
+from workbench.renamed import Renamed, former_arguments
 from workbench.rig.actuators import Actuator
 from workbench.structure.modes import Modes, freeze
 
@@ -55,13 +55,14 @@ class ControlledModeCount:
     untouched, spilled, left = Renamed("uncontrolled"), Renamed("spillover"), Renamed("residual")
 
 
+@former_arguments(most="max_modes")
 def controlled_mode_count(
     modes: Modes,
     state: np.ndarray,
     *,
     weight: ArrayLike,
     share: float = 0.05,
-    most: int | None = None,
+    max_modes: int | None = None,
     places: Callable[[int], ArrayLike] | None = None,
 ) -> ControlledModeCount:
     """The number of modes that IMSC should control.
@@ -71,7 +72,7 @@ def controlled_mode_count(
         state: (2 n_modes,) just after the disturbance, or root mean squares for a random one.
         weight: R of IMSC.
         share: of the disturbance's energy that may remain.
-        most: largest n tried; by default half the modes.
+        max_modes: largest n tried; by default half the modes.
         places: of n actuators, m; by default the nodes of mode n+1.
 
     Raises:
@@ -86,7 +87,7 @@ def controlled_mode_count(
     energy = 0.5 * (state[n_modes:] ** 2 + (modes.omega * state[:n_modes]) ** 2)
     if not energy.sum() > 0:
         raise DesignError("the disturbance gives no mode any energy, so there is nothing to control")
-    counts = np.arange(1, (n_modes // 2 if most is None else most) + 1)
+    counts = np.arange(1, (n_modes // 2 if max_modes is None else max_modes) + 1)
     residual_work, efforts = np.full(counts.size, np.nan), np.full(counts.size, np.nan)
     for i, n in enumerate(counts):
         try:

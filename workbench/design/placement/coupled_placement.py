@@ -60,12 +60,12 @@ def place_coupled(
             f"{rigid} rigid-body modes are controlled, and {counted(n_actuators, 'actuator')} cannot control them"
             f" independently; place at least {rigid} actuators"
         )
-    stretches = limits.intervals(n_actuators, modes.length)
+    intervals = limits.intervals(n_actuators, modes.length)
 
     def objective(positions: np.ndarray) -> float:
         """log W_R; inf where a limit is exceeded."""
         at = np.sort(positions)
-        allowed = all(any(low <= x <= high for low, high in stretches) for x in at)
+        allowed = all(any(low <= x <= high for low, high in intervals) for x in at)
         if not allowed or (np.diff(at) < limits.spacing).any():
             return np.inf
         placement = coupled_costs(modes, n_controlled, at, impulse_at=impulse_at, weight=weight)

@@ -54,7 +54,7 @@ def scan_coupled(
         DesignError: limits that no placement on the grid meets.
     """
     length, settings = modes.length, {"impulse_at": impulse_at, "weight": weight}
-    stretches = limits.intervals(n_actuators, length)
+    intervals = limits.intervals(n_actuators, length)
     step = length / n_places
     grid = step * (0.5 + np.arange(n_places))
     index = np.array(list(combinations_with_replacement(range(n_places), n_actuators)))
@@ -65,7 +65,7 @@ def scan_coupled(
     work, effort = (np.concatenate(parts) for parts in zip(*costs))
     at = grid[index]
     gaps = np.diff(at, axis=1).min(axis=1, initial=np.inf)
-    allowed = free_places(modes.domain, grid, stretches)[index].all(axis=1) & (gaps >= limits.spacing)
+    allowed = free_places(modes.domain, grid, intervals)[index].all(axis=1) & (gaps >= limits.spacing)
     best = None
     for i in np.argsort(np.where(allowed & (effort <= limits.effort), work, np.inf)):
         if not (allowed[i] and effort[i] <= limits.effort and np.isfinite(work[i])):
@@ -76,7 +76,7 @@ def scan_coupled(
             break
     if best is None:
         raise DesignError(f"none of {allowed.sum()} placements on the grid meets the limits; raise them")
-    widened = [(low - step / 2, high + step / 2) for low, high in stretches]
+    widened = [(low - step / 2, high + step / 2) for low, high in intervals]
     near = free_places(modes.domain, grid, widened)[index].all(axis=1)
     near &= gaps + step >= limits.spacing
     near &= _least(index, np.sqrt(effort), n_places) <= np.sqrt(limits.effort)

@@ -100,8 +100,8 @@ class Limits(Constructed):
         """
         domain = task.modes.domain
         if isinstance(domain, Interval):
-            stretches = self.intervals(task.n_controlled, domain.length, task.reach[0])
-            return [(np.array([low]), np.array([high])) for low, high in stretches]
+            intervals = self.intervals(task.n_controlled, domain.length, task.reach[0])
+            return [(np.array([low]), np.array([high])) for low, high in intervals]
         if isinstance(domain, NamedPoints):
             if self.forbidden or self.edge_distance:
                 raise DesignError("named points have no zones or edges; give the allowed points as candidates")

@@ -184,9 +184,9 @@ def explain_spillover(modes: Modes, controller: Controller) -> Explanation:
     residual = [r for r in range(modes.n_modes) if r not in controller.law.controlled]
     open_loop = _open_loop_poles(modes)
     closed = [_nearest_pole(loop, pole) for pole in _poles_of(loop.matrix, modes.n_modes, residual)]
-    ports = input_matrix(modes, controller.law.actuators), reading(modes, controller.sensors)
+    matrices = input_matrix(modes, controller.law.actuators), reading(modes, controller.sensors)
     shifts = [
-        _ResidualMode(modes, controller, *ports, r, open_loop[r]).shifted(pole)
+        _ResidualMode(modes, controller, *matrices, r, open_loop[r]).shifted(pole)
         for r, pole in zip(residual, closed, strict=True)
     ]
     shifts.sort(key=lambda m: -m.closed_pole.real)

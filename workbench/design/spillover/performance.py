@@ -104,7 +104,7 @@ def _check_weight(weight: float) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Compared:
+class LawPerformance:
     """Cost, effort, spillover and stability of one law.
 
     Attributes:
@@ -176,7 +176,7 @@ def laws_of(
 @one_blas_thread
 def compare(
     modes: Modes, laws: Sequence[Law], state: np.ndarray, *, weight: float, final_time: float
-) -> tuple[Compared, ...]:
+) -> tuple[LawPerformance, ...]:
     """Cost, effort, peak force, work by mode and poles of each law, from the same initial state.
 
     Args:
@@ -191,7 +191,7 @@ def compare(
     for law in laws:
         loop = close_loop(modes, law)
         rows.append(
-            Compared(
+            LawPerformance(
                 law=law,
                 cost=quadratic_cost(modes, law, state, weight),
                 effort=effort(modes, law, state),

@@ -18,10 +18,10 @@ from workbench.structure.domain import (
     Between,
     Domain,
     Interval,
+    Location,
     NamedPoints,
     Place,
     Rectangle,
-    Where,
     centred_at,
     middle,
     reach,
@@ -125,7 +125,7 @@ def spillover_remedies(
         best: tuple[float, str, _Setting] | None = None
         for name, where, put in movable:
 
-            def excess_at(at: Where, put: Callable[[Any], _Setting] = put) -> float:
+            def excess_at(at: Location, put: Callable[[Any], _Setting] = put) -> float:
                 return excess(put(at))
 
             moved = _smallest_move(domain, where, excess_at, best[0] if best else np.inf)
@@ -142,19 +142,20 @@ def spillover_remedies(
     return tuple(remedies)
 
 
+@former_arguments(most="max_sensors")
 def sufficient_sensors(
     modes: Modes,
     redesign: Redesign,
     actuators: Sequence[Actuator],
     *,
-    most: int = 60,
+    max_sensors: int = 60,
 ) -> tuple[int | None, np.ndarray]:
     """The least number of evenly spaced sensors that stabilises the loop, and the decay rates of 1, 2, … sensors, 1/s.
 
-    The next three numbers of sensors must stabilise it too. The number is None where up to `most` sensors do not.
+    The next three numbers of sensors must stabilise it too. The number is None where `max_sensors` do not.
     """
-    rates, tolerances = np.full(most, -np.inf), np.zeros(most)
-    for k in range(1, most + 1):
+    rates, tolerances = np.full(max_sensors, -np.inf), np.zeros(max_sensors)
+    for k in range(1, max_sensors + 1):
         places = modes.length * np.arange(1, k + 1) / (k + 1)
         rates[k - 1], tolerances[k - 1] = _decay_rate(modes, redesign, _Setting(tuple(actuators), tuple(places)))
         if k > 3 and (rates[k - 4 : k] > tolerances[k - 4 : k]).all():
@@ -187,8 +188,8 @@ def _smallest(excess: Callable[[float], float], most: float) -> float | None:
 
 
 def _smallest_move(
-    domain: Domain, where: Where, excess: Callable[[Where], float], most: float
-) -> tuple[float, Where] | None:
+    domain: Domain, where: Location, excess: Callable[[Location], float], most: float
+) -> tuple[float, Location] | None:
     """The smallest move of a place with a positive excess: its distance, below `most`, m, and the new place."""
     if isinstance(domain, NamedPoints):
         near = (other for other in _others(domain, where) if other[0] < most)
@@ -201,20 +202,20 @@ def _smallest_move(
     return best
 
 
-def _directions(domain: Interval | Rectangle, where: Where) -> Iterator[tuple[float, Callable[[float], Where]]]:
+def _directions(domain: Interval | Rectangle, where: Location) -> Iterator[tuple[float, Callable[[float], Location]]]:
     """For each direction along each coordinate: the largest distance of a move, m, and the new place by distance."""
     if isinstance(where, Between) and len(domain.coordinates) > 1:
         return
     at, (low, high) = np.atleast_1d(np.asarray(middle(where), float)), reach(domain, where)
     for axis, sign in product(range(at.size), (-1.0, 1.0)):
 
-        def moved(distance: float, axis: int = axis, sign: float = sign) -> Where:
+        def moved(distance: float, axis: int = axis, sign: float = sign) -> Location:
             return centred_at(where, same_place(at + sign * distance * (np.arange(at.size) == axis)))
 
         yield float(at[axis] - low[axis] if sign < 0 else high[axis] - at[axis]), moved
 
 
-def _others(domain: NamedPoints, where: Where) -> list[tuple[float, str]]:
+def _others(domain: NamedPoints, where: Location) -> list[tuple[float, str]]:
     """Distances of the other points of the same direction, m, nearest first, with their names."""
     if domain.positions is None or not isinstance(where, str):
         return []
@@ -224,17 +225,17 @@ def _others(domain: NamedPoints, where: Where) -> list[tuple[float, str]]:
     return sorted((float(distances[i]), domain.names[i]) for i in parallel)
 
 
-def _actuators(start: _Setting) -> Iterator[tuple[str, Where, Callable[[Any], _Setting]]]:
+def _actuators(start: _Setting) -> Iterator[tuple[str, Location, Callable[[Any], _Setting]]]:
     """Of each actuator: its name, its place, and the setting as a function of another place."""
     for j, actuator in enumerate(start.actuators):
 
-        def put(at: Where, j: int = j, actuator: Actuator = actuator) -> _Setting:
+        def put(at: Location, j: int = j, actuator: Actuator = actuator) -> _Setting:
             return replace(start, actuators=(*start.actuators[:j], replace(actuator, at=at), *start.actuators[j + 1 :]))
 
         yield f"actuator {actuator.name}", actuator.at, put
 
 
-def _sensors(start: _Setting, domain: Domain) -> Iterator[tuple[str, Where, Callable[[Any], _Setting]]]:
+def _sensors(start: _Setting, domain: Domain) -> Iterator[tuple[str, Location, Callable[[Any], _Setting]]]:
     """Of each sensor: its name, its place, and the setting as a function of another place."""
     for i, at in enumerate(start.sensors):
 

@@ -187,14 +187,14 @@ def on_off_work(modes: Modes, law: OnOffLaw, state: np.ndarray, final_time: floa
 
 def on_off_motion(modes: Modes, law: OnOffLaw, state: np.ndarray, final_time: float) -> tuple[Response, Floats]:
     """The motion at quadrature instants (n_times,) up to a final time, and the quadrature weights (n_times,), s."""
-    stretches = switchings(modes, law, state, final_time)
-    events = np.unique(np.r_[0.0, [s.end for mode in stretches for s in mode], final_time])
+    segments = switchings(modes, law, state, final_time)
+    events = np.unique(np.r_[0.0, [s.end for mode in segments for s in mode], final_time])
     pieces = np.maximum(1, np.ceil(np.diff(events) * modes.omega.max())).astype(int)
     edges = np.concatenate(
         [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(events[:-1], events[1:], pieces)] + [[final_time]]
     )
     at, weights = gauss_between(edges, GAUSS_POINTS)
-    return motion(modes, law, state, at, stretches), weights
+    return motion(modes, law, state, at, segments), weights
 
 
 def effort(modes: Modes, law: Law, state: np.ndarray) -> float:

@@ -13,8 +13,8 @@ A kind of your own is another `Kind`; pass `(*CATALOGUE, mine)` to the diagnosis
             *place_parameters(rig), Parameter("stiffness", "N/m^2", 1e-9, 1e9, logarithmic=True)
         ),
         apply=lambda rig, _, v: with_element(rig, UserLaw(place_of(v), law, (v["stiffness"],))),
-        starts=lambda evidence, _: [
-            {**place_values(p.at), "stiffness": k} for p in evidence.at_peaks for k in (0.1, 1.0, 10.0)
+        starts=lambda reconstruction, _: [
+            {**place_values(p.at), "stiffness": k} for p in reconstruction.at_peaks for k in (0.1, 1.0, 10.0)
         ],
     )
 """
@@ -24,8 +24,8 @@ from collections.abc import Iterable
 from workbench.gap.effects.effect import Kind
 from workbench.gap.effects.environment import KINDS as OF_THE_ENVIRONMENT
 from workbench.gap.effects.nonlinear import KINDS as NONLINEAR
-from workbench.gap.effects.ports import KINDS as OF_PORTS
 from workbench.gap.effects.structural import KINDS as STRUCTURAL
+from workbench.gap.effects.transducers import KINDS as OF_PORTS
 from workbench.structure.printed import joined_in_words
 
 CATALOGUE: tuple[Kind, ...] = (*STRUCTURAL, *NONLINEAR, *OF_PORTS, *OF_THE_ENVIRONMENT)

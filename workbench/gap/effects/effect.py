@@ -14,7 +14,7 @@ from workbench.records.record import Record
 from workbench.renamed import Renamed, former_arguments
 from workbench.rig.motion import Motion
 from workbench.rig.rig import Rig
-from workbench.structure.domain import Between, Domain, NamedPoints, Rectangle, Where
+from workbench.structure.domain import Between, Domain, Location, NamedPoints, Rectangle
 from workbench.structure.member import Structure
 from workbench.structure.modes import Modes
 
@@ -147,7 +147,7 @@ def place_of(values: Mapping[str, Any]) -> Any:
     return (values["x"], values["y"]) if "x" in values else values.get("at")
 
 
-def place_values(where: Where) -> dict[str, Any]:
+def place_values(where: Location) -> dict[str, Any]:
     """A place as values of an effect."""
     if isinstance(where, tuple) and not isinstance(where, Between):
         return {"x": float(where[0]), "y": float(where[1])}
@@ -165,7 +165,7 @@ class ForceAndMotion:
         absorbed: whether nominal errors may have absorbed linear parts of the force.
     """
 
-    at: Where
+    at: Location
     force: Floats
     displacement: Floats
     velocity: Floats
@@ -187,7 +187,7 @@ class ForceAndMotion:
 
 
 class Measured(Protocol):
-    """The fit records, whole (`records`) and without the settling time at their start (`counted`)."""
+    """The fit records, whole (`records`) and without the transient at their start (`counted`)."""
 
     @property
     def records(self) -> tuple[Record, ...]: ...
@@ -195,10 +195,10 @@ class Measured(Protocol):
     def counted(self) -> tuple[Record, ...]: ...
 
 
-class Evidence(Protocol):
-    """Evidence from which a kind of effect derives start values: rig, records, motion and residuals.
+class Reconstruction(Protocol):
+    """What a kind of effect derives its start values from: rig, records, motion and residuals.
 
-    `workbench.gap.localisation.evidence` computes it.
+    `workbench.gap.localisation.force_reconstruction` computes it.
     """
 
     @property
@@ -226,7 +226,7 @@ class Kind:
         path: "actuator", "structure", "sensor" or "environment".
         parameters: rig, target -> its parameters.
         apply: rig, target, values by name -> the changed rig.
-        starts: evidence, target -> start values of a fit (dicts by parameter name).
+        starts: reconstruction, target -> start values of a fit (dicts by parameter name).
         targets: rig -> its possible targets: names of inputs or outputs, "all", an end; (None,) if there is no choice.
         nonlinear: whether the response then depends on level.
         phrase: its name in the sentence of the verdict.
@@ -260,7 +260,7 @@ class Kind:
     path: str
     parameters: Callable[[Rig, Any], tuple[Parameter, ...]]
     apply: Callable[[Rig, Any, dict[str, Any]], Rig]
-    starts: Callable[[Evidence, Any], Iterable[dict[str, Any]]]
+    starts: Callable[[Reconstruction, Any], Iterable[dict[str, Any]]]
     targets: Callable[[Rig], tuple[Any, ...]] = lambda rig: (None,)
     nonlinear: bool = False
     phrase: str = ""
@@ -372,7 +372,7 @@ class Effect:
         """Its place: x, (x, y), the name of a point, or `Between` two; None if it has none."""
         return place_of(self.values)
 
-    def moved_to(self, where: Where) -> "Effect":
+    def moved_to(self, where: Location) -> "Effect":
         """The same effect at another place."""
         return replace(self, values={**self.values, **place_values(where)})
 
@@ -429,7 +429,7 @@ def apply_all(rig: Rig, effects: Iterable[Effect]) -> Rig:
 
 
 def can_be(rig: Rig, effects: Iterable[Effect]) -> bool:
-    """Whether a rig with these effects is physically possible: no buckling, no stretch beyond the structure."""
+    """Whether a rig with these effects is physically possible: no buckling, no segment beyond the structure."""
     try:
         apply_all(rig, effects)
     except (ValueError, np.linalg.LinAlgError):

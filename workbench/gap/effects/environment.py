@@ -7,9 +7,9 @@ import numpy as np
 
 from workbench.gap.effects.effect import (
     Effect,
-    Evidence,
     Kind,
     Parameter,
+    Reconstruction,
     Scales,
     place_of,
     place_parameters,
@@ -17,7 +17,7 @@ from workbench.gap.effects.effect import (
     positive,
 )
 from workbench.gap.effects.nonlinear import with_element
-from workbench.gap.effects.ports import ACTUATOR_BIAS
+from workbench.gap.effects.transducers import ACTUATOR_BIAS
 from workbench.identification.signal.distortion import period_of
 from workbench.records.record import Record
 from workbench.rig.elements import PeriodicForce, RandomForce
@@ -57,22 +57,22 @@ def _is_distortion(frequency: float, records: Sequence[Record]) -> bool:
     return abs(order - round(order)) / (period * sample_time) < SAME_LINE / duration
 
 
-def _periodic_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
-    records, sample_time = evidence.data.counted, evidence.data.records[0].sample_time
+def _periodic_starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
+    records, sample_time = reconstruction.data.counted, reconstruction.data.records[0].sample_time
     # only samples of one rate have a mean
     alike = [bool(np.isclose(record.sample_time, sample_time, rtol=1e-6, atol=0.0)) for record in records]
     shortest = min(record.n_samples for record, is_alike in zip(records, alike, strict=True) if is_alike)
     starts = np.cumsum([0, *(record.n_samples for record in records)])[:-1][alike]
-    for place in evidence.at_peaks:
+    for place in reconstruction.at_peaks:
         if isinstance(place.at, Between):
             continue
         mean = np.mean([place.force[start : start + shortest] for start in starts], axis=0)
         frequency, amplitude, phase = tone(mean, sample_time)
-        lead = records[0].start_time - evidence.data.records[0].start_time
+        lead = records[0].start_time - reconstruction.data.records[0].start_time
         if lead:  # the phase refers to the start of the record
             turned = 2.0 * np.pi * frequency * lead
             phase = float(np.angle(np.exp(1j * (phase - turned))))
-        if not _is_distortion(frequency, evidence.data.records):
+        if not _is_distortion(frequency, reconstruction.data.records):
             yield {**place_values(place.at), "frequency": frequency, "amplitude": amplitude, "phase": phase}
 
 

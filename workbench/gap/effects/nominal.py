@@ -61,7 +61,7 @@ class NominalPrior:
         late, early: names of the sensors whose delay is positive, or at most zero: with held inputs, acceleration jumps
             at each sample, and no small step leads from one side to the other.
         interpolated: whether delays are linear interpolations between samples, which have no jumps.
-        points: named points of effects, where the mode shapes have errors as at the ports.
+        points: named points of effects, where the mode shapes have errors as at the transducers.
         waves: number of cosines of a smooth variation along the structure, the constant included.
         records, parameter: names of the records between which a parameter varies, and its name.
         by_mode: whether errors are those of each mode.
@@ -194,19 +194,21 @@ def _each_parameter(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
             low = JUST_LATE if sensor.name in prior.late else -LARGEST_DELAY
             high = 0.0 if sensor.name in prior.early else LARGEST_DELAY
             yield with_prior(f"delay_{sensor.name}", prior.delay, DELAY_UNIT, low, high, sensor.name)
-    # a port, and the sensor that alone reads its errors
-    ports: list[tuple[Actuator | Sensor, str]] = [
+    # a transducer, and the sensor that alone reads its errors
+    transducers: list[tuple[Actuator | Sensor, str]] = [
         *((actuator, "") for actuator in rig.actuators),
         *((sensor, sensor.name) for sensor in rig.sensors),
     ]
     if prior.gain:
-        yield from (with_prior(_gain_name(port), prior.gain, PROFILE_UNIT, sensor=own) for port, own in ports)
+        yield from (
+            with_prior(_gain_name(transducer), prior.gain, PROFILE_UNIT, sensor=own) for transducer, own in transducers
+        )
     if prior.place:
-        for port, own in ports:
-            for name, low, high in zip(_place_names(rig, port), *_place_bounds(rig, port), strict=True):
+        for transducer, own in transducers:
+            for name, low, high in zip(_place_names(rig, transducer), *_place_bounds(rig, transducer), strict=True):
                 yield with_prior(name, prior.place, PLACE_UNIT, float(low), float(high), own)
     if prior.shape:
-        for at, own in (*ports, *((point, "") for point in prior.points)):
+        for at, own in (*transducers, *((point, "") for point in prior.points)):
             for name in _shape_names(at, rig.modes.n_modes):
                 yield with_prior(name, prior.shape, PROFILE_UNIT, sensor=own)
     if prior.record:
@@ -259,13 +261,13 @@ def _with_structural_errors(rig: Rig, prior: NominalPrior, values: dict[str, flo
     frequency, damping = (_values_by_mode(values, group, modes.n_modes) for group in ("frequency", "damping"))
     if not (frequency.any() or damping.any()):
         return rig
-    stretch, more = np.exp(frequency), np.exp(damping)
+    scale, more = np.exp(frequency), np.exp(damping)
     if isinstance(structure, Structure):
         structure = replace(structure, frequency_errors=tuple(frequency.tolist()))
     if structure is not None and isinstance(structure.damping, ModalDamping):
         structure = replace(structure, damping=ModalDamping(modes.zeta * more))
-    root = np.sqrt(stretch * more)
-    modes = replace(modes, omega=modes.omega * stretch, damping=modes.damping * np.outer(root, root))
+    root = np.sqrt(scale * more)
+    modes = replace(modes, omega=modes.omega * scale, damping=modes.damping * np.outer(root, root))
     return replace(rig, structure=structure, modes=modes)
 
 
@@ -304,7 +306,7 @@ _structure_solved = solved_once(_with_structural_errors)
 
 
 def _with_errors(rig: Rig, prior: NominalPrior | IdentifiedPrior, values: dict[str, float]) -> Rig:
-    """The rig with all nominal errors: of its structure, modes, ports and between records."""
+    """The rig with all nominal errors: of its structure, modes, transducers and between records."""
     if isinstance(prior, IdentifiedPrior):
         made = prior.make(prior.root @ np.array(list(values.values())))
         modes, kept = made.modes, rig.modes.n_modes
@@ -315,56 +317,61 @@ def _with_errors(rig: Rig, prior: NominalPrior | IdentifiedPrior, values: dict[s
         rig, prior, {name: value for name, value in values.items() if group_of(name) not in OUTSIDE}
     )
     rig = differing(rig, prior.parameter, deviations_of(values))
-    ports: tuple[Actuator | Sensor, ...] = (*rig.actuators, *rig.sensors)
-    units = _shape_units(rig.modes, ports) if prior.shape else np.zeros((len(ports), 0))
+    transducers: tuple[Actuator | Sensor, ...] = (*rig.actuators, *rig.sensors)
+    units = _shape_units(rig.modes, transducers) if prior.shape else np.zeros((len(transducers), 0))
     if prior.shape and prior.points:
-        rig = replace(rig, modes=_modes_with_errors(rig.modes, ports, prior.points, values))
-    off = [_port_with_errors(rig, port, unit, prior, values) for port, unit in zip(ports, units, strict=True)]
-    if all(one is other for one, other in zip(ports, off, strict=True)):
+        rig = replace(rig, modes=_modes_with_errors(rig.modes, transducers, prior.points, values))
+    off = [
+        _transducer_with_errors(rig, transducer, unit, prior, values)
+        for transducer, unit in zip(transducers, units, strict=True)
+    ]
+    if all(one is other for one, other in zip(transducers, off, strict=True)):
         return rig
     n = len(rig.actuators)
     return replace(rig, actuators=tuple(off[:n]), sensors=tuple(off[n:]))
 
 
 def _modes_with_errors(
-    modes: Modes, ports: tuple[Actuator | Sensor, ...], points: tuple[str, ...], values: dict[str, float]
+    modes: Modes, transducers: tuple[Actuator | Sensor, ...], points: tuple[str, ...], values: dict[str, float]
 ) -> Modes:
-    """The modes with errors of their shapes at named points, in units of the rms of each mode at the ports."""
+    """The modes with errors of their shapes at named points, in units of the rms of each mode at the transducers."""
     errors = np.array([[values.get(name, 0.0) for name in _shape_names(point, modes.n_modes)] for point in points])
     if not errors.any():
         return modes
     assert isinstance(modes.domain, NamedPoints)
     rows = np.zeros((len(modes.domain.names), modes.n_modes))
-    rows[modes.domain.locate(points)] = errors * _shape_units(modes, ports).max(axis=0)
+    rows[modes.domain.locate(points)] = errors * _shape_units(modes, transducers).max(axis=0)
     shapes = modes.shapes
     return replace(modes, shapes=lambda located, derivative: shapes(located, derivative) + rows[located])
 
 
-def _port_with_errors(rig: Rig, port: Any, units: Floats, prior: NominalPrior, values: dict[str, float]) -> Any:
+def _transducer_with_errors(
+    rig: Rig, transducer: Any, units: Floats, prior: NominalPrior, values: dict[str, float]
+) -> Any:
     """An actuator or a sensor with errors of its place, gain, mode shapes and timing.
 
     Args:
         rig: with the modes.
-        port: actuator or sensor.
+        transducer: actuator or sensor.
         units: (n_modes,) units of the shape errors.
         prior: of the errors.
         values: of the errors, by name.
     """
     changes: dict[str, Any] = {}
     if prior.place:
-        errors = tuple([values.get(name, 0.0) for name in _place_names(rig, port)])  # shares of the extent
+        errors = tuple([values.get(name, 0.0) for name in _place_names(rig, transducer)])  # shares of the extent
         if any(errors):
-            changes["at"] = _shifted(rig.modes.domain, port.at, errors)
-    if gain := values.get(_gain_name(port), 0.0):
-        changes["gain"] = port.gain * float(np.exp(gain))
+            changes["at"] = _shifted(rig.modes.domain, transducer.at, errors)
+    if gain := values.get(_gain_name(transducer), 0.0):
+        changes["gain"] = transducer.gain * float(np.exp(gain))
     if units.size:
-        own = [values.get(name, 0.0) for name in _shape_names(port, units.size)]
+        own = [values.get(name, 0.0) for name in _shape_names(transducer, units.size)]
         changes["shape_error"] = tuple((units * own).tolist())
-    if delay := values.get(f"delay_{port.name}", 0.0) if isinstance(port, Sensor) else 0.0:
-        changes["delay"] = port.delay + delay * prior.sample_time
-    if prior.interpolated and isinstance(port, Sensor):
+    if delay := values.get(f"delay_{transducer.name}", 0.0) if isinstance(transducer, Sensor) else 0.0:
+        changes["delay"] = transducer.delay + delay * prior.sample_time
+    if prior.interpolated and isinstance(transducer, Sensor):
         changes["interpolated"] = True
-    return _changed(port, tuple(changes.items())) if changes else port
+    return _changed(transducer, tuple(changes.items())) if changes else transducer
 
 
 @lru_cache(maxsize=4096)
@@ -376,52 +383,55 @@ def _shifted(domain: Any, where: Any, errors: tuple[float, ...]) -> Any:
 
 
 @lru_cache(maxsize=4096)
-def _changed(port: Any, changes: tuple[tuple[str, Any], ...]) -> Any:
-    """The port with some attributes changed; cached, as a sensitivity changes one error at a time."""
-    return replace(port, **dict(changes))
+def _changed(transducer: Any, changes: tuple[tuple[str, Any], ...]) -> Any:
+    """The transducer with some attributes changed; cached, as a sensitivity changes one error at a time."""
+    return replace(transducer, **dict(changes))
 
 
-def _place_bounds(rig: Rig, port: Actuator | Sensor) -> Floats:
-    """Lower and upper bounds (2, n_coordinates) of the error of a port's place, as shares of the extent."""
+def _place_bounds(rig: Rig, transducer: Actuator | Sensor) -> Floats:
+    """Lower and upper bounds (2, n_coordinates) of the error of a transducer's place, as shares of the extent."""
     domain = rig.modes.domain
     assert not isinstance(domain, NamedPoints)
-    room: Floats = (np.array(reach(domain, port.at)) - np.asarray(middle(port.at), float)) / domain.size
+    room: Floats = (np.array(reach(domain, transducer.at)) - np.asarray(middle(transducer.at), float)) / domain.size
     return room
 
 
 @lru_cache(maxsize=64)
-def _shape_units(modes: Modes, ports: tuple[Actuator | Sensor, ...]) -> Floats:
-    """Rms of each mode's displacement or slope over all ports of the same kind: (n_ports, n_modes).
+def _shape_units(modes: Modes, transducers: tuple[Actuator | Sensor, ...]) -> Floats:
+    """Rms of each mode's displacement or slope over all transducers of the same kind: (n_transducers, n_modes).
 
     Cached: not to be written to.
     """
-    shapes, kinds = np.array([shape_of(modes, port) for port in ports]), [derivative_of(port) for port in ports]
+    shapes, kinds = (
+        np.array([shape_of(modes, transducer) for transducer in transducers]),
+        [derivative_of(transducer) for transducer in transducers],
+    )
     rms = {kind: np.sqrt((shapes[np.array(kinds) == kind] ** 2).mean(axis=0)) for kind in set(kinds)}
     return np.array([rms[kind] for kind in kinds])
 
 
-def _gain_name(port: Actuator | Sensor) -> str:
-    """Name of the gain error of a port; an actuator and a sensor may have the same name."""
-    return f"gain_{_side(port)}_{port.name}"
+def _gain_name(transducer: Actuator | Sensor) -> str:
+    """Name of the gain error of a transducer; an actuator and a sensor may have the same name."""
+    return f"gain_{_side(transducer)}_{transducer.name}"
 
 
-def _place_names(rig: Rig, port: Actuator | Sensor) -> list[str]:
+def _place_names(rig: Rig, transducer: Actuator | Sensor) -> list[str]:
     """Names of the errors of its place, one a coordinate; none at named points."""
     domain = rig.modes.domain
     coordinates = () if isinstance(domain, NamedPoints) else domain.coordinates
-    return [f"place_{_side(port)}_{port.name}_{name}" for name in coordinates]
+    return [f"place_{_side(transducer)}_{transducer.name}_{name}" for name in coordinates]
 
 
 @lru_cache(maxsize=1024)
 def _shape_names(at: Actuator | Sensor | str, n_modes: int) -> tuple[str, ...]:
-    """Names of the errors of the mode shapes at a port, or at a named point."""
+    """Names of the errors of the mode shapes at a transducer, or at a named point."""
     where = f"in_{at}" if isinstance(at, str) else f"{_side(at)}_{at.name}"
     return tuple(f"shape_{where}_{r}" for r in range(1, n_modes + 1))
 
 
-def _side(port: Actuator | Sensor) -> str:
-    """Part of the name of a port's errors: of an actuator, or at a sensor."""
-    return "of" if isinstance(port, Actuator) else "at"
+def _side(transducer: Actuator | Sensor) -> str:
+    """Part of the name of a transducer's errors: of an actuator, or at a sensor."""
+    return "of" if isinstance(transducer, Actuator) else "at"
 
 
 def parted(errors: Effect) -> tuple[Effect, Effect | None]:
@@ -465,7 +475,7 @@ NOMINAL_ERRORS = Kind(
     path="structure",
     parameters=_parameters,
     apply=_with_errors,
-    starts=lambda evidence, _: [],
+    starts=lambda reconstruction, _: [],
     phrase="small errors of the nominal model",
     applied_first=True,
 )

@@ -9,17 +9,17 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.gap.effects.effect import (
     Effect,
-    Evidence,
     Kind,
     Parameter,
+    Reconstruction,
     Scales,
     place_of,
     place_parameters,
     place_values,
     positive,
 )
-from workbench.gap.effects.ports import ACTUATOR_BIAS
 from workbench.gap.effects.structural import GROUND_SPRING, POINT_DAMPER
+from workbench.gap.effects.transducers import ACTUATOR_BIAS
 from workbench.rig.elements import (
     AirDrag,
     BoucWen,
@@ -50,8 +50,8 @@ def with_element(rig: Rig, element: Element) -> Rig:
 # --- cubic_spring
 
 
-def _cubic_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
-    for place in evidence.at_peaks:
+def _cubic_starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
+    for place in reconstruction.at_peaks:
         k = place.strength_along(place.displacement**3)
         for share in (0.3, 1.0, -1.0, 3.0):
             yield {**place_values(place.at), "stiffness": share * k}
@@ -77,11 +77,11 @@ CUBIC_SPRING = Kind(
 # --- midplane_stretching
 
 
-def _stretching_starts(evidence: Evidence, _: object) -> list[dict[str, float]]:
-    modes = evidence.rig.modes
+def _stretching_starts(reconstruction: Reconstruction, _: object) -> list[dict[str, float]]:
+    modes = reconstruction.rig.modes
     x, w = modes.domain.quadrature(40)
     slopes = modes.phi(x, 1)
-    motion = max(evidence.motions, key=lambda m: np.mean(m.displacement[0] ** 2))
+    motion = max(reconstruction.motions, key=lambda m: np.mean(m.displacement[0] ** 2))
     stretch = float(np.mean(w @ (slopes @ motion.displacement[:, ::7]) ** 2))
     first = int(np.argmax(modes.omega > 0))
     tension = modes.omega[first] ** 2 / float(w @ slopes[:, first] ** 2)
@@ -104,10 +104,10 @@ MIDPLANE_STRETCHING = Kind(
 # --- air_drag
 
 
-def _drag_starts(evidence: Evidence, _: object) -> list[dict[str, float]]:
-    modes = evidence.rig.modes
+def _drag_starts(reconstruction: Reconstruction, _: object) -> list[dict[str, float]]:
+    modes = reconstruction.rig.modes
     x = modes.length * np.linspace(0.05, 0.95, 19)
-    speeds = [np.sqrt(np.mean((modes.phi(x) @ m.velocity[:, ::5]) ** 2)) for m in evidence.motions]
+    speeds = [np.sqrt(np.mean((modes.phi(x) @ m.velocity[:, ::5]) ** 2)) for m in reconstruction.motions]
     mass = 1.0 / float(np.mean(modes.phi(x)[:, 0] ** 2)) / modes.length
     first = int(np.argmax(modes.omega > 0))
     viscous = 2 * 0.01 * modes.omega[first] * mass
@@ -141,9 +141,9 @@ def _contact_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
     return (*place_parameters(rig), stiffness, positive("gap", "m", scales.length))
 
 
-def _contact_starts(two_sided: bool) -> Callable[[Evidence, object], Iterator[dict[str, Any]]]:
-    def starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
-        for place in evidence.at_peaks:
+def _contact_starts(two_sided: bool) -> Callable[[Reconstruction, object], Iterator[dict[str, Any]]]:
+    def starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
+        for place in reconstruction.at_peaks:
             reach = np.abs(place.displacement) if two_sided else place.displacement
             if not (reach > 0).any():  # the motion stays on the other side, as under a constant force
                 continue
@@ -188,8 +188,8 @@ ONE_SIDED_STOP = Kind(
 # --- coulomb_friction
 
 
-def _friction_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
-    for place in evidence.at_peaks:
+def _friction_starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
+    for place in reconstruction.at_peaks:
         speed = float(np.sqrt(np.mean(place.velocity**2)))
         for share in (0.02, 0.1, 0.3):
             force = place.strength_along(np.tanh(place.velocity / (share * speed)))
@@ -269,10 +269,10 @@ COULOMB_FRICTION = Kind(
 # --- bouc_wen
 
 
-def _bouc_wen_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
+def _bouc_wen_starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
     # with named points, the likeliest places need not be close to the right one, which may come third
-    most = None if isinstance(evidence.rig.modes.domain, NamedPoints) else 2
-    for place in evidence.at_peaks[:most]:
+    most = None if isinstance(reconstruction.rig.modes.domain, NamedPoints) else 2
+    for place in reconstruction.at_peaks[:most]:
         size = float(np.sqrt(np.mean(place.displacement**2)))
         for share in (0.03, 0.1, 0.3, 1.0, 3.0):
             k = place.strength_along(hysteresis(place.displacement, share * size))
@@ -306,8 +306,8 @@ BOUC_WEN = Kind(
 # --- joint_slip
 
 
-def _slip_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
-    for place in evidence.at_peaks:
+def _slip_starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
+    for place in reconstruction.at_peaks:
         size = float(np.sqrt(np.mean(place.displacement**2)))
         for share in (0.03, 0.1, 0.3, 1.0, 3.0) if isinstance(place.at, Between) else ():
             k = -place.strength_along(place.displacement - hysteresis(place.displacement, share * size))
@@ -343,8 +343,8 @@ JOINT_SLIP = Kind(
 # --- two_way_friction
 
 
-def _two_way_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
-    for place in evidence.at_peaks:
+def _two_way_starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
+    for place in reconstruction.at_peaks:
         speed = float(np.sqrt(np.mean(place.velocity**2)))
         for share in (0.02, 0.1, 0.3):
             basis = np.column_stack([np.tanh(place.velocity / (share * speed)), np.ones(place.velocity.size)])
@@ -400,8 +400,8 @@ TWO_WAY_FRICTION = Kind(
 # --- quadratic_damper
 
 
-def _quadratic_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
-    for place in evidence.at_peaks:
+def _quadratic_starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
+    for place in reconstruction.at_peaks:
         c = place.strength_along(np.abs(place.velocity) * place.velocity)
         for share in (0.4, 1.0, 2.5) if c > 0 else ():
             yield {**place_values(place.at), "coefficient": share * c}
@@ -446,8 +446,8 @@ def _power_force(v: Mapping[str, Any], motion: Floats) -> Floats:
 
 
 def _power_law(element: type, name: str, motion: str, words: str, *, even: bool = False) -> Kind:
-    def starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
-        for place in evidence.at_peaks:
+    def starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
+        for place in reconstruction.at_peaks:
             path = getattr(place, motion)
             rms = float(np.sqrt(np.mean(path**2)))
             for exponent in EXPONENTS if rms > 0 else ():

@@ -9,9 +9,9 @@ import numpy as np
 
 from workbench.gap.effects.effect import (
     Effect,
-    Evidence,
     Kind,
     Parameter,
+    Reconstruction,
     Scales,
     place_of,
     place_parameters,
@@ -180,7 +180,7 @@ def _scaled_modes(modes: Modes, factor: float) -> Modes:
     return replace(modes, omega=modes.omega * factor, damping=modes.damping * factor)
 
 
-def _modulus_starts(evidence: Evidence, _: object) -> list[dict[str, float]]:
+def _modulus_starts(reconstruction: Reconstruction, _: object) -> list[dict[str, float]]:
     return [{"factor": f} for f in np.exp(np.linspace(-0.6, 0.6, 41)) if abs(f - 1) > 1e-3] + [
         {"factor": f} for f in (0.995, 1.005)
     ]
@@ -202,17 +202,17 @@ MODULUS_ERROR = Kind(
 
 def _point_starts(
     name: str, series: str, unit: str, *, between: bool = True, signed: bool = False
-) -> Callable[[Evidence, object], Iterator[dict[str, Any]]]:
-    def starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
-        size = getattr(Scales.of(evidence.rig), unit)
-        for place in evidence.at_peaks:
+) -> Callable[[Reconstruction, object], Iterator[dict[str, Any]]]:
+    def starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
+        size = getattr(Scales.of(reconstruction.rig), unit)
+        for place in reconstruction.at_peaks:
             if isinstance(place.at, Between) and not between:
                 continue
             k = replace(place, absorbed=False).strength_along(getattr(place, series))  # a linear force is sought itself
             for share in (0.4, 1.0, 2.0):
                 if k > 0 or signed:
                     yield {**place_values(place.at), name: share * k}
-        for where in evidence.places_to_try:
+        for where in reconstruction.places_to_try:
             for share in (0.004, 0.02, 0.1, 0.4):
                 yield {**place_values(where), name: share * size}
 
@@ -286,8 +286,8 @@ def _with_loss(rig: Rig, _: object, values: dict[str, float]) -> Rig:
     length = member.length
     start, stop = values["at"] - 0.5 * values["width"], values["at"] + 0.5 * values["width"]
     if start < -EDGE * length or stop > (1.0 + EDGE) * length:
-        # a stretch beyond the end has no effect, so place and width could not be distinguished
-        raise ValueError(f"the stretch from {start:.4g} to {stop:.4g} reaches beyond the structure")
+        # a segment beyond the end has no effect, so place and width could not be distinguished
+        raise ValueError(f"the segment from {start:.4g} to {stop:.4g} reaches beyond the structure")
     profile: Any = member.stiffness.scaled(1.0 - values["loss"], max(start, 0.0), min(stop, length))
     return resolved(rig, replace(member, **{member.stiffness_name: profile}))
 
@@ -305,8 +305,8 @@ def _first_width(place: float, length: float) -> float:
     return min(0.1 * length, 1.5 * place, 1.5 * (length - place))
 
 
-def _loss_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
-    length = evidence.domain.size
+def _loss_starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
+    length = reconstruction.domain.size
     for x in (0.04, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.96):
         for loss in (0.003, 0.01, 0.03, 0.12, 0.45):
             yield {"at": x * length, "width": _first_width(x * length, length), "loss": loss}
@@ -358,8 +358,8 @@ SUPPORT_ROTATION = Kind(
     path="structure",
     parameters=lambda rig, _: (positive("rotational_stiffness", "N m/rad", _end_stiffness(rig), 1e-4, 1e5),),
     apply=solved_once(_with_rotational_spring),
-    starts=lambda evidence, _: [
-        {"rotational_stiffness": _end_stiffness(evidence.rig) * s} for s in np.geomspace(0.01, 3000.0, 16)
+    starts=lambda reconstruction, _: [
+        {"rotational_stiffness": _end_stiffness(reconstruction.rig) * s} for s in np.geomspace(0.01, 3000.0, 16)
     ],
     targets=_ends,
     phrase="a support that is neither hinged nor clamped",
@@ -398,8 +398,8 @@ AXIAL_LOAD = Kind(
     path="structure",
     parameters=_load_parameters,
     apply=solved_once(_with_tension),
-    starts=lambda evidence, _: [
-        {"tension": share * buckling_load(evidence.rig)}
+    starts=lambda reconstruction, _: [
+        {"tension": share * buckling_load(reconstruction.rig)}
         for share in (-0.9, -0.6, -0.4, -0.25, -0.15, -0.08, -0.03)
         + (0.03, 0.08, 0.15, 0.25, 0.4, 0.6, 1.0, 1.5, 2.5, 4.0)
     ],
@@ -433,7 +433,7 @@ TRUNCATED_MODES = Kind(
     path="structure",
     parameters=lambda rig, _: (),
     apply=solved_once(_with_modes),
-    starts=lambda evidence, _: [{}],
+    starts=lambda reconstruction, _: [{}],
     targets=lambda rig: () if rig.structure is None else tuple(range(rig.modes.n_modes + 1, rig.modes.n_modes + 17)),
     phrase="modes left out of the model",
     simpler=_with_one_mode_fewer,
@@ -464,7 +464,9 @@ MODAL_DAMPING = Kind(
     path="structure",
     parameters=lambda rig, _: (Parameter("factor", "", 1e-3, 100.0, logarithmic=True, neutral=1.0),),
     apply=solved_once(_with_scaled_damping),
-    starts=lambda evidence, _: [{"factor": f} for f in (0.2, 0.4, 0.6, 0.8, 0.9, 1.1, 1.25, 1.6, 2.2, 3.0, 5.0, 8.0)],
+    starts=lambda reconstruction, _: [
+        {"factor": f} for f in (0.2, 0.4, 0.6, 0.8, 0.9, 1.1, 1.25, 1.6, 2.2, 3.0, 5.0, 8.0)
+    ],
     phrase="a damping error common to all modes",
 )
 
@@ -474,8 +476,8 @@ MODAL_DAMPING = Kind(
 DRIFTS = (0.02, 0.05, 0.08, 0.12, 0.18, 0.27, 0.4, 0.6)  # relative, over a record: start values of either sign
 
 
-def _drift_starts(evidence: Evidence, _: object) -> list[dict[str, float]]:
-    longest = max(record.n_samples * record.sample_time for record in evidence.data.records)
+def _drift_starts(reconstruction: Reconstruction, _: object) -> list[dict[str, float]]:
+    longest = max(record.n_samples * record.sample_time for record in reconstruction.data.records)
     return [{"rate": share / longest} for share in (*(-share for share in DRIFTS[::-1]), *DRIFTS)]
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
 from workbench.arrays import Floats
-from workbench.gap.localisation.evidence import Evidence, minima
 from workbench.gap.localisation.force_lines import Lines
+from workbench.gap.localisation.force_reconstruction import ForceReconstruction, minima
 from workbench.renamed import Renamed
 from workbench.structure.domain import Between, Interval, NamedPoints, Rectangle
 from workbench.threads import one_blas_thread
@@ -66,52 +66,58 @@ class ForceLocation:
 
 
 @one_blas_thread
-def locate_force(evidence: Evidence) -> ForceLocation:
+def locate_force(reconstruction: ForceReconstruction) -> ForceLocation:
     """Locate the one force, of any law, that best explains the gap.
 
     One sensor locates nothing, since a force anywhere explains its readings. Sensors with a lag are left out.
     """
-    evidence = evidence.without([sensor.name for sensor in evidence.rig.sensors if sensor.time_constant > 0])
-    domain, places = evidence.domain, evidence.places
-    at: Any = evidence.peaks[0]
-    if len(evidence.rig.sensors) < 2:
+    reconstruction = reconstruction.without(
+        [sensor.name for sensor in reconstruction.rig.sensors if sensor.time_constant > 0]
+    )
+    domain, places = reconstruction.domain, reconstruction.places
+    at: Any = reconstruction.peaks[0]
+    if len(reconstruction.rig.sensors) < 2:
         std = 0.0 if isinstance(domain, NamedPoints) else domain.size / np.sqrt(12.0)
         return ForceLocation(places, np.zeros(len(places)), at, std, 0.0, None)
-    informative = evidence.informative(at)
+    informative = reconstruction.informative(at)
     if isinstance(domain, Interval):
-        valleys = places[minima(evidence.misfits(places, informative))[: LOCALISATION.valleys]]
+        valleys = places[minima(reconstruction.misfits(places, informative))[: LOCALISATION.valleys]]
         # minima are compared by equal weights: each one's own would favour it
-        at = min(evidence.workers.map(partial(_refined, evidence), valleys), key=evidence.misfit)
-        informative = evidence.informative(at)
-        profile, std = evidence.misfits(places, informative), _deviation(evidence, informative, at)
+        at = min(reconstruction.workers.map(partial(_refined, reconstruction), valleys), key=reconstruction.misfit)
+        informative = reconstruction.informative(at)
+        profile, std = reconstruction.misfits(places, informative), _deviation(reconstruction, informative, at)
     elif isinstance(domain, Rectangle):
-        refined = [_refined_over(evidence, domain, peak) for peak in evidence.peaks]
-        at, std = min(refined, key=lambda each: evidence.misfit(each[0]))
-        informative = evidence.informative(at)
-        profile = evidence.screened(places, informative)
+        refined = [_refined_over(reconstruction, domain, peak) for peak in reconstruction.peaks]
+        at, std = min(refined, key=lambda each: reconstruction.misfit(each[0]))
+        informative = reconstruction.informative(at)
+        profile = reconstruction.screened(places, informative)
     else:
-        ranked = [places[i] for i in np.argsort(-evidence.profile, kind="stable") if isinstance(places[i], Between)]
+        ranked = [
+            places[i] for i in np.argsort(-reconstruction.profile, kind="stable") if isinstance(places[i], Between)
+        ]
         points = [where for where in places if not isinstance(where, Between)]
         places = [*points, *ranked[: LOCALISATION.pairs_shown]]
-        profile = evidence.misfits(places, informative)
+        profile = reconstruction.misfits(places, informative)
         at, std = places[int(np.argmin(profile))], 0.0
-    lowest = min(evidence.misfit(at, informative), profile.min())
-    degrees_of_freedom = sum(each.degrees_of_freedom for each in evidence.lines)
-    left = evidence.misfit(at) / max(degrees_of_freedom, 1) - 1.0
+    lowest = min(reconstruction.misfit(at, informative), profile.min())
+    degrees_of_freedom = sum(each.degrees_of_freedom for each in reconstruction.lines)
+    left = reconstruction.misfit(at) / max(degrees_of_freedom, 1) - 1.0
     std *= np.sqrt(max(left, 0.0) + 1.0)
-    return ForceLocation(places, -0.5 * (profile - lowest), at, std, *_explained(evidence, degrees_of_freedom, left))
+    return ForceLocation(
+        places, -0.5 * (profile - lowest), at, std, *_explained(reconstruction, degrees_of_freedom, left)
+    )
 
 
-def _explained(evidence: Evidence, degrees_of_freedom: int, left: float) -> tuple[float, bool | None]:
+def _explained(reconstruction: ForceReconstruction, degrees_of_freedom: int, left: float) -> tuple[float, bool | None]:
     """Share of the gap's power that one force explains, and whether that is all of it; None if it cannot be tested.
 
     Args:
-        evidence: of the nominal rig.
+        reconstruction: of the nominal rig.
         degrees_of_freedom: of the residual given the force.
         left: its power above the noise, in units of the noise power.
     """
-    values = 2 * sum(each.left.size for each in evidence.lines)
-    gap = sum(each.power for each in evidence.lines) - values
+    values = 2 * sum(each.left.size for each in reconstruction.lines)
+    gap = sum(each.power for each in reconstruction.lines) - values
     if degrees_of_freedom == 0 or gap < LOCALISATION.chance * np.sqrt(2.0 * values):
         return 0.0, None
     chance = LOCALISATION.chance * np.sqrt(2.0 / degrees_of_freedom)
@@ -120,17 +126,17 @@ def _explained(evidence: Evidence, degrees_of_freedom: int, left: float) -> tupl
 
 
 def _refined_over(
-    evidence: Evidence, rectangle: Rectangle, top: tuple[float, float]
+    reconstruction: ForceReconstruction, rectangle: Rectangle, top: tuple[float, float]
 ) -> tuple[tuple[float, float], float]:
     """The local minimum of the misfit on a rectangle, and its standard error along the longer axis, m."""
-    informative, extent = evidence.informative(top), np.array(rectangle.length)
+    informative, extent = reconstruction.informative(top), np.array(rectangle.length)
 
     def inside(xy: Floats) -> tuple[float, float]:
         x, y = np.clip(xy, LOCALISATION.edge * extent, (1.0 - LOCALISATION.edge) * extent)
         return float(x), float(y)
 
     def misfit(xy: Floats) -> float:
-        return evidence.misfit(inside(xy), informative)
+        return reconstruction.misfit(inside(xy), informative)
 
     reach = LOCALISATION.near * rectangle.size
     options = {
@@ -146,32 +152,32 @@ def _refined_over(
     return at, float(min(step * np.sqrt(2.0 / flattest), rectangle.size))
 
 
-def _refined(evidence: Evidence, top: float) -> float:
+def _refined(reconstruction: ForceReconstruction, top: float) -> float:
     """The local minimum of the misfit along an interval."""
-    at, informative = float(top), evidence.informative(top)
-    length, spacing = evidence.domain.size, evidence.places[1] - evidence.places[0]
+    at, informative = float(top), reconstruction.informative(top)
+    length, spacing = reconstruction.domain.size, reconstruction.places[1] - reconstruction.places[0]
     edge, beside = LOCALISATION.edge * length, LOCALISATION.beside * spacing
     for _ in range(LOCALISATION.rounds):
         found = minimize_scalar(
-            evidence.misfit,
+            reconstruction.misfit,
             bounds=(max(at - beside, edge), min(at + beside, length - edge)),
             args=(informative,),
             method="bounded",
             options={"xatol": LOCALISATION.resolved * spacing},
         )
         moved, at = abs(found.x - at), float(found.x)
-        informative = evidence.informative(at)
+        informative = reconstruction.informative(at)
         if moved < LOCALISATION.resolved * spacing:
             break
     return at
 
 
-def _deviation(evidence: Evidence, lines: Sequence[Lines], at: float) -> float:
+def _deviation(reconstruction: ForceReconstruction, lines: Sequence[Lines], at: float) -> float:
     """Standard error of a place along an interval, m: a quarter of that in which the misfit rises by less than 4."""
-    length, level = evidence.domain.size, evidence.misfit(at, lines) + LOCALISATION.two_sigma
+    length, level = reconstruction.domain.size, reconstruction.misfit(at, lines) + LOCALISATION.two_sigma
 
     def is_outside(x: float) -> bool:
-        return not 0 < x < length or evidence.misfit(x, lines) > level
+        return not 0 < x < length or reconstruction.misfit(x, lines) > level
 
     def distance(side: float) -> float:
         inside, outside = 0.0, 1e-5 * length

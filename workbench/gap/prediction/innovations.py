@@ -15,7 +15,7 @@ from workbench.rig.readings import read, reading_of
 from workbench.rig.rig import KEPT, Rig
 from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import move, prediction_errors
-from workbench.structure.domain import Interval, Where
+from workbench.structure.domain import Interval, Location
 from workbench.structure.modes import Modes
 
 LOOSE = 0.01  # of the inputs' rms: process noise forces that set the observer gain
@@ -45,7 +45,7 @@ class Observer:
         force: float,
         sample_times: Iterable[float],
         *,
-        at: Where | None = None,
+        at: Location | None = None,
         rms: float = 0.0,
         loose: float = LOOSE,
     ) -> "Observer":

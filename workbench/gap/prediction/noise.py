@@ -14,7 +14,7 @@ from workbench.gap.prediction.unmodelled_force import ForceFilter, force_filter,
 from workbench.records.record import Record
 from workbench.rig.actuators import mixing
 from workbench.rig.rig import Rig, shape_of
-from workbench.rig.simulate import predict
+from workbench.rig.simulate import simulate_record
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def noise_guessed(rig: Rig, records: Sequence[Record]) -> np.ndarray:
     Raises:
         ValueError: for a sensor without noise, stated or not, as in records of a simulation.
     """
-    left = [record.outputs - predict(rig, record) for record in records]
+    left = [record.outputs - simulate_record(rig, record) for record in records]
     bands = [_band_means(series) for series in (*left, *(record.outputs for record in records))]
     least = np.min([np.quantile(means, NOISE.least, axis=1) for means in bands], axis=0)
     for sensor, power in zip(rig.sensors, least, strict=True):
@@ -205,7 +205,7 @@ def logging_noise_power(rig: Rig, data: FitData) -> np.ndarray:
     longest = max(data.counted, key=lambda record: record.n_samples)
     pulses = np.eye(len(rig.actuators))[:, :, None] * (np.arange(longest.n_samples) == 0)
     linear = replace(rig, elements=())
-    answers = np.array([predict(linear, replace(longest, inputs=pulse)) for pulse in pulses])
+    answers = np.array([simulate_record(linear, replace(longest, inputs=pulse)) for pulse in pulses])
     so_far = (answers**2).cumsum(axis=2)  # (n_inputs, n_outputs, n_samples)
     by_input = [so_far[:, :, : record.n_samples].mean(axis=2) for record in data.counted]
     each = zip(data.counted, by_input, strict=True)
@@ -219,7 +219,7 @@ def loudest_logging_noise(rig: Rig, data: FitData) -> np.ndarray:
     linear = replace(rig, elements=())
 
     def power(record: Record) -> Floats:
-        response = predict(linear, replace(record, inputs=noise_of_inputs(record, rng)))
+        response = simulate_record(linear, replace(record, inputs=noise_of_inputs(record, rng)))
         mean_square: Floats = (response**2).mean(axis=1) / data.noise**2
         return mean_square
 

@@ -23,7 +23,7 @@ from workbench.gap.prediction.unmodelled_force import (
     whiten,
 )
 from workbench.rig.rig import Rig
-from workbench.structure.domain import NamedPoints, Where, same_place
+from workbench.structure.domain import Location, NamedPoints, same_place
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class RandomForceFit:
         tonal: smallest share of the force's power, of all records, in its mean and one sinusoid.
     """
 
-    at: Where
+    at: Location
     rms: float
     at_std: tuple[float, ...]
     colour: Floats
@@ -122,7 +122,7 @@ class RandomForceFit:
 
 
 def fit_random_force(
-    rig: Rig, data: FitData, residuals: Sequence[np.ndarray], places: Sequence[Where], size: float
+    rig: Rig, data: FitData, residuals: Sequence[np.ndarray], places: Sequence[Location], size: float
 ) -> RandomForceFit:
     """Maximum-likelihood estimate of place, strength and colour, from the best of a grid.
 
@@ -139,13 +139,13 @@ def fit_random_force(
     extent = np.zeros(0) if isinstance(domain, NamedPoints) else np.atleast_1d(domain.length)
     d = extent.size  # coordinates of a place that can be fitted
 
-    def place_of(point: np.ndarray, start: Where) -> Where:
+    def place_of(point: np.ndarray, start: Location) -> Location:
         return start if d == 0 else same_place(point[:d] * extent)
 
     def memory_at(point: np.ndarray) -> float:
         return float(1.0 / (1.0 + np.exp(-point[d + 1])))
 
-    def loss(point: np.ndarray, family: tuple[Where, int, bool], records: list[np.ndarray]) -> float:
+    def loss(point: np.ndarray, family: tuple[Location, int, bool], records: list[np.ndarray]) -> float:
         start, stages, flat = family
         memory = memory_at(point)
         if not ((point[:d] >= 0.0) & (point[:d] <= 1.0)).all() or memory > RANDOM_FORCE.longest_memory:
@@ -164,7 +164,7 @@ def fit_random_force(
     place, log_size, logit_of_memory = RANDOM_FORCE.first_place, RANDOM_FORCE.first_log_rms, RANDOM_FORCE.first_logit
     steps = np.vstack([np.zeros(d + 2), np.diag(np.r_[np.full(d, place), log_size, logit_of_memory])])
 
-    def refined(start: np.ndarray, family: tuple[Where, int, bool], records: list[np.ndarray], most: int) -> Any:
+    def refined(start: np.ndarray, family: tuple[Location, int, bool], records: list[np.ndarray], most: int) -> Any:
         inwards = np.r_[np.where(start[:d] + place > 1.0, -1.0, 1.0), 1.0, 1.0]
         options = {
             "initial_simplex": start + inwards * steps,
@@ -174,7 +174,7 @@ def fit_random_force(
         }
         return minimize(loss, start, args=(family, records), method="Nelder-Mead", options=options)
 
-    likely: dict[tuple[int, bool], tuple[np.ndarray, tuple[Where, int, bool]]] = {}
+    likely: dict[tuple[int, bool], tuple[np.ndarray, tuple[Location, int, bool]]] = {}
     for start, family in sorted(grid, key=lambda each: loss(each[0], each[1], quick)):
         likely.setdefault(family[1:], (start, family))
     half_evaluations = RANDOM_FORCE.evaluations // 2
@@ -237,7 +237,7 @@ def model_filter(model: SampledModel, rig: Rig, found: RandomForceFit) -> ForceF
     return _filter(model, rig, found.at, found.rms, found.colour)
 
 
-def _filter(model: SampledModel, rig: Rig, at: Where, rms: float, colour: Floats) -> ForceFilter:
+def _filter(model: SampledModel, rig: Rig, at: Location, rms: float, colour: Floats) -> ForceFilter:
     """The Kalman filter for a random force of a place, an rms (N) and a colour."""
     variance = np.array([rms**2 / _power(colour)])
     return force_filter(model, rig.modes.phi_at(at)[:, None], variance, colour)

@@ -23,9 +23,9 @@ from workbench.structure.modes import Modes
 REMEMBERED = 2  # cached motions a record: of 45,000 requests in searches, 4,400 are of the last two, 140 of older ones
 
 
-def lead_of(record: Record, settle: float) -> int:
-    """Number of samples in the first `settle` seconds of a record."""
-    return min(round(settle / record.sample_time), record.n_samples - 1)
+def lead_of(record: Record, transient: float) -> int:
+    """Number of samples in the first `transient` seconds of a record."""
+    return min(round(transient / record.sample_time), record.n_samples - 1)
 
 
 def scale_of(measured: Floats) -> Floats:
@@ -42,7 +42,7 @@ class FitData:
         records: measured, all with the rig's inputs and outputs.
         noise: (n_outputs,) standard deviation of each sensor's noise, rounding included.
         substeps: of a sample, for nonlinear rigs.
-        settle: seconds at the start of each record that are simulated but not counted, since the simulation starts
+        transient: seconds at the start of each record that are simulated but not counted, since the simulation starts
             from rest and the rig did not.
         whiteners: by record, the filter that whitens the response to random forces; empty for none. With an observer,
             nonlinear laws then act on the measured motion, since the simulated one lacks these forces.
@@ -58,7 +58,7 @@ class FitData:
     records: tuple[Record, ...]
     noise: np.ndarray
     substeps: int = 4
-    settle: float = 0.0
+    transient: float = 0.0
     whiteners: Mapping[str, ForceFilter] = field(default_factory=dict)
     nuisance: Floats | None = None
     observer: Observer | None = None
@@ -145,10 +145,10 @@ class FitData:
 
     @cached_property
     def counted(self) -> tuple[Record, ...]:
-        """The records without the samples of `settle` at their start."""
-        if self.settle == 0:
+        """The records without the samples of `transient` at their start."""
+        if self.transient == 0:
             return self.records
-        return tuple(record.between(record.time[lead_of(record, self.settle)]) for record in self.records)
+        return tuple(record.between(record.time[lead_of(record, self.transient)]) for record in self.records)
 
     def motions(self, rig: Rig) -> tuple[Motion, ...]:
         """The rig's motion on each record; the last few are cached, since a sensor's fault does not change it."""
@@ -166,7 +166,7 @@ class FitData:
             sample_time=record.sample_time,
             substeps=self.substeps,
             input_hold=record.input_hold,
-        ).after(lead_of(record, self.settle))
+        ).after(lead_of(record, self.transient))
         with self._lock:
             self._memory[key] = (rig.modes, motion)
             while len(self._memory) > REMEMBERED * len(self.records):
@@ -217,15 +217,15 @@ class FitData:
                 for record, left in whole
             ]
         each_ahead = zip(self.records, ahead, strict=True)
-        return np.concatenate([errors[:, lead_of(record, self.settle) :].ravel() for record, errors in each_ahead])
+        return np.concatenate([errors[:, lead_of(record, self.transient) :].ravel() for record, errors in each_ahead])
 
     @property
     def _from_the_first_sample(self) -> "FitData":
-        return self._with_its_lead if self.settle else self  # cached, a reference to itself would outlive the search
+        return self._with_its_lead if self.transient else self  # cached, a reference to itself would outlive the search
 
     @cached_property
     def _with_its_lead(self) -> "FitData":
-        return replace(self, settle=0.0)
+        return replace(self, transient=0.0)
 
     @property
     def mixes_sensors(self) -> bool:
@@ -246,7 +246,7 @@ class FitData:
             return self.differences(rig)
         return [
             observer.residual_on_measured_motion(rig.in_record(record.name), record, self.substeps)[
-                :, lead_of(record, self.settle) :
+                :, lead_of(record, self.transient) :
             ]
             for record in self.records
         ]

@@ -16,7 +16,7 @@ from workbench.gap.prediction.residuals import FitData, lead_of, scale_of
 from workbench.gap.search.settings import JOINT
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
-from workbench.rig.simulate import predict
+from workbench.rig.simulate import simulate_record
 from workbench.structure.domain import Domain
 
 AT_BOUND = 0.99  # of the largest noise that a search accepts: estimates above it are at the bound
@@ -71,7 +71,7 @@ class Shrinkage:
     ci95: tuple[float, float]
 
 
-def measure(nominal: Rig, corrected: Rig, records: Sequence[Record], *, settle: float = 0.0) -> Shrinkage | None:
+def measure(nominal: Rig, corrected: Rig, records: Sequence[Record], *, transient: float = 0.0) -> Shrinkage | None:
     """The shrinkage of the gap on validation records, from the nominal to the corrected rig; None without records.
 
     Its interval is from a bootstrap over the blocks of `block_length`.
@@ -80,10 +80,10 @@ def measure(nominal: Rig, corrected: Rig, records: Sequence[Record], *, settle: 
         return None
     before, after, floor, blocks, lengths = {}, {}, {}, [], []
     for record in records:
-        lead = lead_of(record, settle)
+        lead = lead_of(record, transient)
         measured = record.outputs[:, lead:]
         scale = scale_of(measured)
-        predicted = [predict(rig, record)[:, lead:] for rig in (nominal, corrected)]
+        predicted = [simulate_record(rig, record)[:, lead:] for rig in (nominal, corrected)]
         errors = [((measured - prediction) / scale) ** 2 for prediction in predicted]
         noise = np.array([s.noise_std for s in nominal.sensors])[:, None] / scale
         before[record.name], after[record.name] = (float(np.sqrt(e.mean())) for e in errors)
@@ -222,7 +222,7 @@ def budget_of(
     *,
     noise_found: np.ndarray,
     logged: float = 0.0,
-    settle: float = 0.0,
+    transient: float = 0.0,
 ) -> Budget:
     """The budget: the mean square of the nominal residual, divided among its causes.
 
@@ -237,7 +237,7 @@ def budget_of(
         records: held out of the fit, or the fitted ones if none were.
         noise_found: (n_outputs,) estimated standard deviation of each sensor's noise.
         logged: noise of the logged inputs, as a share of their rms.
-        settle: seconds at the start of each record that are not compared.
+        transient: seconds at the start of each record that are not compared.
     """
 
     labels, causes = labels_of(effects, rig.modes.domain), list(effects)
@@ -246,18 +246,18 @@ def budget_of(
         labels.append(label_of(varying.target.parameter))
         causes.append(varying)
     causes += [] if common is None else [common]
-    nominal, left = (residual_powers(rig, chosen, records, settle) for chosen in ((), causes))
-    without = [residual_powers(rig, [c for c in causes if c is not cause], records, settle) for cause in causes]
+    nominal, left = (residual_powers(rig, chosen, records, transient) for chosen in ((), causes))
+    without = [residual_powers(rig, [c for c in causes if c is not cause], records, transient) for cause in causes]
     weights = np.array([np.maximum(w - left, 0.0) for w in without]).reshape(len(causes), len(records))
     total = weights.sum(axis=0)
     removed = np.maximum(nominal - left, 0.0) * weights / np.where(total > 0, total, 1.0)
     by_size = sorted(range(len(labels)), key=lambda i: -removed[i].sum())
     rows = [*removed[by_size], removed[-1] if common is not None else np.zeros_like(left)]
-    noise = np.minimum(np.array([noise_power(record, noise_found, settle) for record in records]), left)
+    noise = np.minimum(np.array([noise_power(record, noise_found, transient) for record in records]), left)
     rest = left - noise
     by_inputs = np.zeros_like(left)
     if logged:
-        by_inputs = np.minimum(logged**2 * power_of_inputs(rig, records, settle), rest)
+        by_inputs = np.minimum(logged**2 * power_of_inputs(rig, records, transient), rest)
     rows[-1], rest = rows[-1] + by_inputs, rest - by_inputs
     for row, i in enumerate(by_size):  # an unpredictable effect causes all of the remaining residual
         if causes[i].kind.unpredictable:
@@ -291,7 +291,7 @@ def labels_of(effects: Sequence[Effect], domain: Domain) -> list[str]:
     ]
 
 
-def residual_powers(rig: Rig, effects: Sequence[Effect], records: Sequence[Record], settle: float) -> Floats:
+def residual_powers(rig: Rig, effects: Sequence[Effect], records: Sequence[Record], transient: float) -> Floats:
     """Mean square residual (n_records,) by a rig with effects, as `signal_power`; `RUNAWAY` for an impossible rig."""
     try:
         corrected = apply_all(rig, effects)
@@ -299,26 +299,28 @@ def residual_powers(rig: Rig, effects: Sequence[Effect], records: Sequence[Recor
         return np.full(len(records), RUNAWAY)
     # without one of two effects that balance each other, the response may diverge
     with np.errstate(over="ignore", invalid="ignore"):
-        powers = [signal_power(record, record.outputs - predict(corrected, record), settle) for record in records]
+        powers = [
+            signal_power(record, record.outputs - simulate_record(corrected, record), transient) for record in records
+        ]
     return np.array([power if power < RUNAWAY else RUNAWAY for power in powers])
 
 
-def signal_power(record: Record, readings: np.ndarray, settle: float) -> float:
+def signal_power(record: Record, readings: np.ndarray, transient: float) -> float:
     """Mean square of signals (n_outputs, n_samples), each sensor scaled by the standard deviation of its readings."""
-    lead = lead_of(record, settle)
+    lead = lead_of(record, transient)
     return float(((readings[:, lead:] / scale_of(record.outputs[:, lead:])) ** 2).mean())
 
 
-def noise_power(record: Record, noise: np.ndarray, settle: float) -> float:
+def noise_power(record: Record, noise: np.ndarray, transient: float) -> float:
     """Mean square of noise (n_outputs,), each sensor scaled by the standard deviation of a record's readings."""
-    measured = record.outputs[:, lead_of(record, settle) :]
+    measured = record.outputs[:, lead_of(record, transient) :]
     return float(((noise[:, None] / scale_of(measured)) ** 2).mean())
 
 
-def power_of_inputs(rig: Rig, records: Sequence[Record], settle: float) -> np.ndarray:
+def power_of_inputs(rig: Rig, records: Sequence[Record], transient: float) -> np.ndarray:
     """Residual power (n_records,) due to input noise as large as the inputs, as `loudest_logging_noise`."""
-    powers = loudest_logging_noise(rig, FitData(tuple(records), np.ones(len(rig.sensors)), settle=settle))
-    scales = np.array([scale_of(record.outputs[:, lead_of(record, settle) :])[:, 0] for record in records])
+    powers = loudest_logging_noise(rig, FitData(tuple(records), np.ones(len(rig.sensors)), transient=transient))
+    scales = np.array([scale_of(record.outputs[:, lead_of(record, transient) :])[:, 0] for record in records])
     return np.asarray((powers / scales**2).mean(axis=1))
 
 
@@ -408,7 +410,7 @@ class RecordToRecord:
 
 
 def with_held_out(
-    rig: Rig, effects: Sequence[Effect], records: Sequence[Record], *, settle: float = 0.0
+    rig: Rig, effects: Sequence[Effect], records: Sequence[Record], *, transient: float = 0.0
 ) -> tuple[Effect, ...]:
     """The effects, with the deviations of a parameter that varies from record to record fitted to held-out records.
 
@@ -423,7 +425,7 @@ def with_held_out(
 
     def power(deviation: float, record: Record, name: str) -> float:
         own = replace(errors, values={**errors.values, name: deviation})
-        return float(residual_powers(rig, (*others, own), [record], settle)[0])
+        return float(residual_powers(rig, (*others, own), [record], transient)[0])
 
     for record in records:
         name = f"record_{record.name}"

@@ -9,7 +9,7 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.gap.effects.catalogue import CATALOGUE, in_words
 from workbench.gap.effects.effect import COORDINATES, Effect, Kind, apply_all, can_be
-from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.localisation.force_reconstruction import ForceReconstruction
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import Workers
 from workbench.gap.search.fit import Fit
@@ -17,7 +17,7 @@ from workbench.gap.setup.record_checks import LEAST_SAMPLES
 from workbench.records.record import Record
 from workbench.renamed import Renamed
 from workbench.rig.rig import Rig
-from workbench.structure.domain import Between, Where, same_place
+from workbench.structure.domain import Between, Location, same_place
 
 INDISTINGUISHABLE = 0.995  # correlation of two responses
 DETECTABLE = 25.0  # of chi-squared: five standard deviations
@@ -48,13 +48,15 @@ class Detectability:
     invisible, alike = Renamed("undetectable"), Renamed("indistinguishable")
 
 
-def detectability(evidence: Evidence, *, catalogue: tuple[Kind, ...] = CATALOGUE) -> Detectability:
+def detectability(reconstruction: ForceReconstruction, *, catalogue: tuple[Kind, ...] = CATALOGUE) -> Detectability:
     """The detectability of each kind of effect, from simulations at a strength that the records show."""
-    rig, data = evidence.rig, evidence.data.stepped(SUBSTEPS)
+    rig, data = reconstruction.rig, reconstruction.data.stepped(SUBSTEPS)
     base = data.residual(rig)
     labels, responses, strengths = [], [], {}
     candidates = [(k, target) for k in catalogue if k.found_in != "residual" for target in k.targets(rig)]
-    for effect, change in evidence.workers.map(lambda each: _first_detectable(*each, evidence, data, base), candidates):
+    for effect, change in reconstruction.workers.map(
+        lambda each: _first_detectable(*each, reconstruction, data, base), candidates
+    ):
         if effect is None:
             continue
         size = float(np.linalg.norm(change))
@@ -77,14 +79,14 @@ def detectability(evidence: Evidence, *, catalogue: tuple[Kind, ...] = CATALOGUE
 
 
 def _first_detectable(
-    kind: Kind, target: Any, evidence: Evidence, data: FitData, base: Floats
+    kind: Kind, target: Any, reconstruction: ForceReconstruction, data: FitData, base: Floats
 ) -> tuple[Effect | None, Floats]:
     """An effect at the first detectable strength, or at that of largest change; and its change (n,) of the residual."""
     best, change, most = None, np.zeros(0), -1.0
-    for effect in _at_strengths(kind, target, evidence):
+    for effect in _at_strengths(kind, target, reconstruction):
         with np.errstate(over="ignore", invalid="ignore"):
             try:
-                moved = (data.residual(effect.apply(evidence.rig)) - base)[::THINNING]
+                moved = (data.residual(effect.apply(reconstruction.rig)) - base)[::THINNING]
                 chi_squared = float(moved @ moved) * THINNING
             except (ValueError, np.linalg.LinAlgError):
                 continue
@@ -95,30 +97,30 @@ def _first_detectable(
     return best, change
 
 
-def _at_strengths(kind: Kind, target: Any, evidence: Evidence) -> Iterator[Effect]:
+def _at_strengths(kind: Kind, target: Any, reconstruction: ForceReconstruction) -> Iterator[Effect]:
     """An effect at the start values of a search, and with each parameter of the first and last changed by decades.
 
     Start values follow from the unmodelled force. If there is none they are arbitrary: their place may be at a support,
     where no effect shows. So the place of largest motion is tried last.
     """
-    starts = [Effect(kind, target, dict(values)) for values in kind.starts(evidence, target)]
+    starts = [Effect(kind, target, dict(values)) for values in kind.starts(reconstruction, target)]
     if starts:
         yield starts[0]
-        yield from _by_decades(starts[0], evidence.rig)
+        yield from _by_decades(starts[0], reconstruction.rig)
         yield from starts[1:]
-        yield from _by_decades(starts[-1], evidence.rig)
+        yield from _by_decades(starts[-1], reconstruction.rig)
         if starts[0].at is not None:
-            moved = starts[0].moved_to(_place_of_largest_motion(evidence))
+            moved = starts[0].moved_to(_place_of_largest_motion(reconstruction))
             yield moved
-            yield from _by_decades(moved, evidence.rig)
+            yield from _by_decades(moved, reconstruction.rig)
 
 
-def _place_of_largest_motion(evidence: Evidence) -> Where:
+def _place_of_largest_motion(reconstruction: ForceReconstruction) -> Location:
     """The place with the largest displacement, among those where a force is searched for."""
-    power = sum(motion.displacement @ motion.displacement.T for motion in evidence.motions)
-    places = [where for where in evidence.places if not isinstance(where, Between)]
-    shapes = evidence.rig.modes.phi(places)
-    largest: Where = same_place(places[int(np.argmax(np.sum((shapes @ power) * shapes, axis=1)))])
+    power = sum(motion.displacement @ motion.displacement.T for motion in reconstruction.motions)
+    places = [where for where in reconstruction.places if not isinstance(where, Between)]
+    shapes = reconstruction.rig.modes.phi(places)
+    largest: Location = same_place(places[int(np.argmax(np.sum((shapes @ power) * shapes, axis=1)))])
     return largest
 
 

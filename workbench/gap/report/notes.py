@@ -6,7 +6,7 @@ import numpy as np
 
 from workbench.gap.effects.effect import Effect
 from workbench.gap.effects.nominal import NominalPrior, deviations_of
-from workbench.gap.localisation.where import WHERE
+from workbench.gap.localisation.breakdown import BREAKDOWN
 from workbench.gap.prediction.residuals import lead_of
 from workbench.gap.report.budget import PLURAL, Budget, block_length
 from workbench.gap.report.verdict import Verdict
@@ -16,7 +16,7 @@ from workbench.gap.setup.corrections import SetupFault
 from workbench.gap.setup.records import data_faults
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
-from workbench.rig.simulate import predict
+from workbench.rig.simulate import simulate_record
 from workbench.structure.printed import joined_in_words
 
 ABOVE = 0.2  # of the gap: a larger share above the last mode is remarked
@@ -34,7 +34,7 @@ def notes_of(
     faults: Sequence[SetupFault],
     errors: Effect | None,
     power: float,
-    settle: float,
+    transient: float,
     seconds: float | None,
 ) -> tuple[str, ...]:
     """The notes, in the order in which they are stated.
@@ -46,7 +46,7 @@ def notes_of(
         faults: of the set-up.
         errors: of the nominal model, those of held-out records included; None if none were fitted.
         power: mean square of the gap, each sensor scaled by the standard deviation of its readings.
-        settle: seconds at the start of each record that are not compared.
+        transient: seconds at the start of each record that are not compared.
         seconds: limit of the search.
     """
     found, budget, outcome = verdict.attribution, verdict.budget, verdict.outcome
@@ -55,14 +55,14 @@ def notes_of(
         if found.best.effects:
             notes += _of_residual(budget, power, verdict.tolerance)
     else:
-        in_validation = data_faults(verdict.nominal, validation, settle=settle)
-        notes += [*data_faults(verdict.nominal, records, settle=settle), *in_validation]
+        in_validation = data_faults(verdict.nominal, validation, transient=transient)
+        notes += [*data_faults(verdict.nominal, records, transient=transient), *in_validation]
         is_faulty = in_validation or any(record.name in fault.records for fault in faults for record in validation)
         if outcome == "part" != found.outcome and not is_faulty:
             notes.append(OVER_FITTING)
         if not verdict.disagreeing:
             notes += _of_gap(verdict)
-        notes += filter(None, [steady_remainder(verdict.corrected, (*records, *validation), settle=settle)])
+        notes += filter(None, [steady_remainder(verdict.corrected, (*records, *validation), transient=transient)])
     guessed = [sensor.name for sensor in verdict.nominal.sensors if sensor.name in found.search.data.guessed]
     if guessed:
         notes.append(f"noise_std of {', '.join(guessed)} is not stated; it was estimated from the records.")
@@ -90,13 +90,13 @@ def _of_gap(verdict: Verdict) -> Iterator[str]:
             f"Record {where.record_names[i]!r}: on {('odd', 'even')[j]} lines that the inputs do not excite, the gap is"
             f" {10.0 * np.log10(where.distortions[i, j]):.0f} dB above the noise: a nonlinearity is present."
         )
-    if verdict.attribution.evidence.has_several_rates:
+    if verdict.attribution.reconstruction.has_several_rates:
         yield "The records have several sample rates, so no random force was sought: bring them to one rate for that."
     if verdict.outcome == "unknown" and verdict.budget.is_open and verdict.budget.errors:
         yield "Most of the gap is unexplained, so the fitted sizes of the model's errors are not meaningful."
 
 
-def steady_remainder(rig: Rig, records: Sequence[Record], *, settle: float = 0.0) -> str | None:
+def steady_remainder(rig: Rig, records: Sequence[Record], *, transient: float = 0.0) -> str | None:
     """A remark if the residual above the noise is of the same size at all levels of the inputs; else None.
 
     Its rms is fitted by a power of the level; the standard error of the exponent follows from the scatter over blocks
@@ -105,21 +105,21 @@ def steady_remainder(rig: Rig, records: Sequence[Record], *, settle: float = 0.0
     Args:
         rig: corrected.
         records: at several levels; those without inputs or with a residual at the noise floor are ignored.
-        settle: seconds at the start of each record that are not compared.
+        transient: seconds at the start of each record that are not compared.
     """
     noise = np.array([sensor.noise_std for sensor in rig.sensors])[:, None]
     by_level = []
     for record in records:
         level = np.sqrt(np.mean(record.inputs**2))
-        lead = lead_of(record, settle)
-        power = (((record.outputs - predict(rig, record))[:, lead:] / noise) ** 2).mean(axis=0)
-        if level > 0 and power.mean() > (1.0 + WHERE.clear) ** 2:
+        lead = lead_of(record, transient)
+        power = (((record.outputs - simulate_record(rig, record))[:, lead:] / noise) ** 2).mean(axis=0)
+        if level > 0 and power.mean() > (1.0 + BREAKDOWN.clear) ** 2:
             blocks = np.array_split(power, power.size // block_length(rig, power.size, record.sample_time))
             means = np.array([block.mean() for block in blocks])
             scatter = means.std(ddof=1) / np.sqrt(means.size)
             by_level.append((level, power.mean() - 1.0, scatter / (power.mean() - 1.0), record.name))
     by_level.sort()
-    if len(by_level) < 2 or by_level[-1][0] < WHERE.louder * by_level[0][0]:
+    if len(by_level) < 2 or by_level[-1][0] < BREAKDOWN.louder * by_level[0][0]:
         return None
     levels, powers, scatters = np.array([each[:3] for each in by_level]).T
     weights = 4.0 / scatters**2  # inverse variances of the logarithm of the rms

@@ -9,7 +9,7 @@ import numpy as np
 from workbench.gap.effects.effect import ALL, COORDINATES, Effect, names_in
 from workbench.gap.effects.nominal import NOMINAL_ERRORS
 from workbench.gap.effects.nonlinear import any_beyond
-from workbench.gap.localisation.where import Where
+from workbench.gap.localisation.breakdown import GapBreakdown
 from workbench.gap.report.budget import MOSTLY, REMARKED, Budget, RecordToRecord, Shrinkage, labels_of
 from workbench.gap.report.experiment import Detectability, Experiment
 from workbench.gap.search.attribute import Attribution
@@ -60,7 +60,7 @@ class Verdict:
     outcome: str
     effects: tuple[Effect, ...]
     alternatives: tuple[tuple[str, float], ...]
-    where: Where
+    where: GapBreakdown
     shrinkage: Shrinkage | None
     corrected: Rig
     nominal: Rig
@@ -353,7 +353,7 @@ class Verdict:
                 {"kind": label, "words": words, "probability": rounded(p)}
                 for (label, p), (words, _) in zip(self.alternatives, self.alternatives_in_words, strict=True)
             ],
-            "where": where_json(self.where),
+            "where": breakdown_json(self.where),
             "gap": self._gap,
             "shrinkage": {
                 **all_rounded(shrink.share if shrink else {}),
@@ -415,7 +415,7 @@ def _place_json(where: Any) -> dict[str, Any]:
     return {"at": where if isinstance(where, str) else rounded(where)}
 
 
-def where_json(where: Where) -> dict[str, Any]:
+def breakdown_json(where: GapBreakdown) -> dict[str, Any]:
     """The location of a gap as plain numbers."""
     return {
         "path": where.path,

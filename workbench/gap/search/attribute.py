@@ -11,7 +11,7 @@ from workbench.arrays import Floats
 from workbench.deadline import NEVER, Deadline
 from workbench.gap.effects.effect import Effect, Kind, apply_all, each_left_out, merged_sets, simpler_forms
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior, nominal_errors
-from workbench.gap.effects.ports import (
+from workbench.gap.effects.transducers import (
     SENSOR_CLIPPING,
     SENSOR_DELAY,
     SENSOR_QUANTISATION,
@@ -19,7 +19,7 @@ from workbench.gap.effects.ports import (
     exchanged_last,
     step_of,
 )
-from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.localisation.force_reconstruction import ForceReconstruction
 from workbench.gap.prediction.noise import LEAST_LOGGED, logging_noise, shows_input_noise
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
@@ -55,7 +55,7 @@ class Attribution:
         nominal_cost: mean square of the nominal residual, in units of the noise.
         tried: single effects fitted to whole records, with the random disturbance if there is one.
         ahead: the best fit of each kind alone to one-step-ahead predictions.
-        evidence: of the nominal rig.
+        reconstruction: of the nominal rig.
         search: records (with the noise of rounded sensors), rig and candidate kinds of the search.
         whitened: the records that the best set was fitted to, whitened for input noise if there is some.
         noise: (n_outputs,) estimated standard deviation of each sensor's noise, in its unit.
@@ -73,7 +73,7 @@ class Attribution:
     nominal_cost: float
     tried: tuple[Fit, ...]
     ahead: tuple[Fit, ...]
-    evidence: Evidence
+    reconstruction: ForceReconstruction
     search: Search
     whitened: FitData
     noise: np.ndarray
@@ -104,12 +104,12 @@ class Attribution:
         best = replace(best, effects=(*self.seen, *best.effects))
         return replace(self, best=best, noise=search.noise_with(best))
 
-    def with_given(self, given: tuple[Effect, ...], nominal: Evidence) -> "Attribution":
+    def with_given(self, given: tuple[Effect, ...], nominal: ForceReconstruction) -> "Attribution":
         """The attribution to the nominal rig, of one to that rig with channels exchanged or more modes.
 
         Args:
             given: exchanges of two channels each, and missing modes.
-            nominal: evidence of the rig without them.
+            nominal: the force reconstructed with the rig without them.
         """
         return replace(
             self,
@@ -117,7 +117,7 @@ class Attribution:
             best=_with_given(self.best, given),
             alternatives=tuple((_with_given(found, given), p) for found, p in self.alternatives),
             nominal_cost=cost_of(nominal.rig, (), nominal.data),
-            evidence=nominal,
+            reconstruction=nominal,
             given=given,
         )
 
@@ -150,17 +150,17 @@ def baseline(
     rig: Rig,
     records: Sequence[Record],
     *,
-    settle: float,
+    transient: float,
     guessed: frozenset[str],
     workers: Workers,
     deadline: Deadline,
-) -> tuple[tuple[Effect, ...], Evidence, Evidence]:
-    """Effects that show in the readings themselves; evidence of the nominal rig, and of the rig with these effects.
+) -> tuple[tuple[Effect, ...], ForceReconstruction, ForceReconstruction]:
+    """Effects that show in the readings; the force reconstructed with the nominal rig, and with the rig with these.
 
     Args:
         rig: nominal.
         records: fit records; no validation records.
-        settle: seconds at the start of each record that are simulated but not counted.
+        transient: seconds at the start of each record that are simulated but not counted.
         guessed: names of the sensors without a stated noise.
         workers: processes that share the work.
         deadline: of the search that follows.
@@ -170,14 +170,14 @@ def baseline(
         name = rig.sensors[int(np.argmin(noise))].name
         raise ValueError(f"sensor {name} has no noise_std; the diagnosis weights every residual by it")
     seen, heard = _seen_in_readings(rig, records, noise)
-    data = FitData(tuple(records), heard, settle=settle, guessed=guessed, deadline=deadline)
-    evidence = Evidence.of(apply_all(rig, seen), data, workers=workers)
-    _ = evidence.at_peaks  # computed once, before processes are forked
+    data = FitData(tuple(records), heard, transient=transient, guessed=guessed, deadline=deadline)
+    reconstruction = ForceReconstruction.of(apply_all(rig, seen), data, workers=workers)
+    _ = reconstruction.at_peaks  # computed once, before processes are forked
     if not seen:
-        return seen, evidence, evidence
-    nominal = evidence.of_rig(rig)
+        return seen, reconstruction, reconstruction
+    nominal = reconstruction.of_rig(rig)
     _ = nominal.at_peaks
-    return seen, nominal, evidence
+    return seen, nominal, reconstruction
 
 
 def _seen_in_readings(rig: Rig, records: Sequence[Record], noise: Floats) -> tuple[tuple[Effect, ...], Floats]:
@@ -198,8 +198,8 @@ def _seen_in_readings(rig: Rig, records: Sequence[Record], noise: Floats) -> tup
 
 def attribute(
     seen: tuple[Effect, ...],
-    nominal: Evidence,
-    evidence: Evidence,
+    nominal: ForceReconstruction,
+    reconstruction: ForceReconstruction,
     *,
     catalogue: tuple[Kind, ...],
     progress: Callable[[str, float], None],
@@ -214,7 +214,7 @@ def attribute(
     has no significant parameter then makes it "unknown".
 
     Args:
-        seen, nominal, evidence: of `baseline`.
+        seen, nominal, reconstruction: of `baseline`.
         catalogue: kinds of effects to try.
         progress: called with (what, share done) as the search proceeds.
         uncertain_nominal: fit nominal errors jointly with every effect from the first, for a model known to be
@@ -222,12 +222,12 @@ def attribute(
         tolerance: of the signal's rms: a smaller gap above the noise is not searched for causes.
         identified: errors of a nominal rig that was itself identified.
     """
-    rig, data, workers = evidence.rig, evidence.data, evidence.workers
+    rig, data, workers = reconstruction.rig, reconstruction.data, reconstruction.workers
     of_nominal = data.by_channel(data.residual(nominal.rig))
     start = Fit(seen, cost_of(rig, (), data), data.by_channel(data.residual(rig)), 0)
     quick, first = most_informative(data, start.cost_by_channel)
     search = Search(rig, data, quick, first, catalogue, progress, workers, of_nominal, tolerance=tolerance)
-    stages = Stages(search, start, evidence, nominal, uncertain_nominal)
+    stages = Stages(search, start, reconstruction, nominal, uncertain_nominal)
     outcome, best, random, alternatives, noise, own_search = stages.decision()
     missing, stages = stages.missing, stages.beside_missing or stages
     search = stages.search
@@ -275,7 +275,7 @@ def attribute(
         nominal_cost=float(of_nominal.mean()),
         tried=tuple(stages.singles),
         ahead=tuple(stages.ahead),
-        evidence=nominal,
+        reconstruction=nominal,
         search=search,
         whitened=final_search.data,
         noise=noise,
@@ -299,7 +299,7 @@ def _with_one_for_two(search: Search, best: Fit) -> Fit:
     here = cost_of(search.rig, best.effects, search.data.finely(SELECTION.fine))
     for two in combinations(linear, 2):
         rest = tuple(effect for effect in best.effects if effect not in two)
-        ahead = one_more(narrow, rest, search.evidence_with(rest))
+        ahead = one_more(narrow, rest, search.reconstruction_with(rest))
         for fewer in on_whole_records(narrow, ahead, PAIRS.more):
             extra = max(best.n_parameters - fewer.n_parameters, 0)
             if search.explains(fewer) and not search.distinguishes(here, fewer.cost, extra):

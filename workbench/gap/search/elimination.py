@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from functools import partial
 
 from workbench.gap.effects.effect import contained, each_left_out, key_of, merged_sets, simpler_sets, with_one_simpler
-from workbench.gap.search.errors_as_effects import may_be_port_errors
+from workbench.gap.search.errors_as_effects import may_be_transducer_errors
 from workbench.gap.search.fit import Fit, parameters_of
 from workbench.gap.search.jointly import (
     JointFit,
@@ -79,7 +79,7 @@ def _simpler_singles(search: Search, best: JointFit, ahead: Sequence[Fit]) -> li
     on_quick = fitted_to_quick(search, likely, best)
     near = [step for step in on_quick if step.fit.cost < STEPWISE.near * best.fit.cost]
     fitted = [fitted_to_all(search, step) for step in near]
-    return [step for step in fitted if not may_be_port_errors(search, step.effects)]
+    return [step for step in fitted if not may_be_transducer_errors(search, step.effects)]
 
 
 def limiting_case(search: Search, step: JointFit, gap: float) -> JointFit:

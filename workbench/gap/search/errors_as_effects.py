@@ -8,7 +8,8 @@ import numpy as np
 
 from workbench.gap.effects.effect import Effect, Kind, place_values
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, group_of, in_group, nominal_errors
-from workbench.gap.effects.ports import (
+from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
+from workbench.gap.effects.transducers import (
     ACTUATOR_DELAY,
     ACTUATOR_GAIN,
     ACTUATOR_LAG,
@@ -18,7 +19,6 @@ from workbench.gap.effects.ports import (
     SENSOR_LAG,
     SENSOR_MISPLACEMENT,
 )
-from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.search.fit import Fit, cost_of
 from workbench.gap.search.jointly import (
     TIMING,
@@ -38,7 +38,7 @@ from workbench.structure.member import Structure
 
 UNIFORM = (MODULUS_ERROR, MODAL_DAMPING)  # one factor of all stiffness or all damping, which nominal errors include
 NO_UNIFORM_ERROR = tuple(Effect(kind, None, {"factor": 1.0}) for kind in UNIFORM)  # start values
-PORT_GROUPS = ("delay", "gain", "place")  # groups of nominal errors of actuators and sensors
+TRANSDUCER_GROUPS = ("delay", "gain", "place")  # groups of nominal errors of actuators and sensors
 DELAYS_OF_ALL = (SENSOR_LAG, ACTUATOR_LAG, ACTUATOR_DELAY)  # kinds that delay all sensors equally
 
 
@@ -55,7 +55,7 @@ def is_linear_structural(kind: Kind) -> bool:
 
 
 def is_plausible_error(effect: Effect, search: Search) -> bool:
-    """Whether an effect at a port is a plausible error of a careful model: a small delay, gain or shift of place."""
+    """Whether an effect at a transducer is a plausible error of a careful model: a small delay, gain or shift."""
     return is_plausible_delay(effect, search) or is_plausible_gain_or_place(effect, search.rig)
 
 
@@ -106,8 +106,8 @@ def is_plausible_gain_or_place(effect: Effect, rig: Rig) -> bool:
     return rig.modes.domain.separation(effect.at, middle(places[0])) < ERRORS.most_moved
 
 
-def may_be_port_errors(search: Search, effects: Sequence[Effect]) -> bool:
-    """Whether one of the effects may be a plausible error of a port, which the nominal errors include already."""
+def may_be_transducer_errors(search: Search, effects: Sequence[Effect]) -> bool:
+    """Whether one of the effects may be a plausible error of a transducer, which the nominal errors include already."""
     return is_timing(search, effects) or any(is_plausible_gain_or_place(effect, search.rig) for effect in effects)
 
 
@@ -126,24 +126,28 @@ def uniform_as_nominal_errors(search: Search, found: Fit, *, alone: bool = False
     """
     uniform = {e.kind.name: float(np.log(e.values["factor"])) for e in found.effects if e.kind in UNIFORM}
     others = [e for e in found.effects if e.kind not in UNIFORM]
-    port_errors = next((e for e in others if e.kind is NOMINAL_ERRORS), None)
-    named = [e for e in others if e is not port_errors]
+    transducer_errors = next((e for e in others if e.kind is NOMINAL_ERRORS), None)
+    named = [e for e in others if e is not transducer_errors]
     if not named or len(uniform) < (1 if alone else len(UNIFORM)):
         return found
     largest = dict(ERRORS.most_alone if len(uniform) == 1 else ERRORS.most_common)
     if any(abs(size) >= largest[name] for name, size in uniform.items()):
         return found
-    if port_errors is not None and not set(port_errors.target.groups) <= set(PORT_GROUPS):
+    if transducer_errors is not None and not set(transducer_errors.target.groups) <= set(TRANSDUCER_GROUPS):
         return found
     stiffness, damping = (uniform.get(kind.name, 0.0) for kind in UNIFORM)
     if isinstance(search.rig.structure, Structure):
         sizes = {"stiffness": stiffness, "damping": damping}
     else:  # without known profiles, all frequencies have the same error
         sizes = {"frequency": 0.5 * stiffness, "damping": damping}
-    prior = NominalPrior(sample_time=search.data.records[0].sample_time) if port_errors is None else port_errors.target
+    prior = (
+        NominalPrior(sample_time=search.data.records[0].sample_time)
+        if transducer_errors is None
+        else transducer_errors.target
+    )
     errors = nominal_errors(search.rig, replace(prior, **{name: abs(size) for name, size in sizes.items()}, waves=1))
     values = {name: sizes.get(group_of(name), 0.0) for name in errors.values}
-    values.update({} if port_errors is None else port_errors.values)
+    values.update({} if transducer_errors is None else transducer_errors.values)
     return replace(found, effects=(*named, replace(errors, values=values)), covariance=None)
 
 
@@ -220,9 +224,9 @@ def with_delay_as_error(search: Search, errors: Effect, late: Effect) -> Effect:
     return nominal_errors(search.rig, prior, values)
 
 
-def with_wrong_ports(search: Search, step: JointFit) -> JointFit:
+def with_wrong_transducers(search: Search, step: JointFit) -> JointFit:
     """The step with errors of gain and place as effects, each too large for a careful laboratory and outlying."""
-    for _ in range(ERRORS.wrong_ports):
+    for _ in range(ERRORS.wrong_transducers):
         suspect = max(_suspects(search, step), key=lambda s: s.size, default=None)
         if suspect is None:
             break
@@ -239,7 +243,7 @@ def with_wrong_ports(search: Search, step: JointFit) -> JointFit:
 
 
 class _Suspect(NamedTuple):
-    """An effect of a port in place of its nominal error, and the size of the error over the limit of effects."""
+    """An effect of a transducer in place of its nominal error, and the size of the error over the limit of effects."""
 
     effect: Effect
     size: float
@@ -251,28 +255,28 @@ def _suspects(search: Search, step: JointFit) -> Iterator[_Suspect]:
     actuators, sensors = zip(rig.actuators, off.actuators, strict=True), zip(rig.sensors, off.sensors, strict=True)
     sides = ((ACTUATOR_GAIN, ACTUATOR_MISPLACEMENT, actuators), (SENSOR_GAIN, SENSOR_MISPLACEMENT, sensors))
     named = {(effect.kind, effect.target): effect for effect in step.effects}
-    for of_gain, of_place, ports in sides:
-        for nominal, port in ports:
+    for of_gain, of_place, transducers in sides:
+        for nominal, transducer in transducers:
             known = named.get((of_gain, nominal.name))
-            gain = port.gain / nominal.gain if nominal.gain else 1.0
+            gain = transducer.gain / nominal.gain if nominal.gain else 1.0
             size = abs(float(np.log(gain))) / ERRORS.most_gain
             if of_gain in search.catalogue and size > ERRORS.suspect:
                 gain *= 1.0 if known is None else known.values["gain"]
                 yield _Suspect(Effect(of_gain, nominal.name, {"gain": gain}), size)
             if of_place in search.catalogue and step.errors.target.place and (of_place, nominal.name) not in named:
-                effect = Effect(of_place, nominal.name, place_values(middle(port.at)))
+                effect = Effect(of_place, nominal.name, place_values(middle(transducer.at)))
                 size = _size(rig, effect) / ERRORS.most_moved
                 if size > ERRORS.suspect:
                     yield _Suspect(effect, size)
 
 
 def _size(rig: Rig, effect: Effect) -> float:
-    """Size of an error of gain (its logarithm) or of place (of the extent) of a port, as an effect."""
+    """Size of an error of gain (its logarithm) or of place (of the extent) of a transducer, as an effect."""
     if "gain" in effect.values:
         gain = effect.values["gain"]
         return abs(float(np.log(gain))) if gain > 0.0 else 0.0  # a gain that passed zero: the fit has gone astray
-    ports = rig.actuators if effect.kind.path == "actuator" else rig.sensors
-    nominal = next(port.at for port in ports if port.name == effect.target)
+    transducers = rig.actuators if effect.kind.path == "actuator" else rig.sensors
+    nominal = next(transducer.at for transducer in transducers if transducer.name == effect.target)
     return rig.modes.domain.separation(effect.at, middle(nominal))
 
 

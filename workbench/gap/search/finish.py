@@ -17,14 +17,14 @@ from workbench.gap.effects.effect import (
     simpler_sets,
     with_one_simpler,
 )
-from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.localisation.force_reconstruction import ForceReconstruction
 from workbench.gap.search.fit import Chord, Fit, cost_of, finite_residual, fit
 from workbench.gap.search.search import Alternatives, Search, best_of_each, promise
 from workbench.gap.search.settings import FINISH, SEARCH, SELECTION
 from workbench.rig.simulate import is_stepped
-from workbench.structure.domain import Between, Domain, Interval, Rectangle, Where
+from workbench.structure.domain import Between, Domain, Interval, Location, Rectangle
 
-PORTS = ("actuator", "sensor")  # paths of effects of actuators and sensors
+TRANSDUCERS = ("actuator", "sensor")  # paths of effects of actuators and sensors
 
 
 def finished(search: Search, candidate: Fit) -> Fit:
@@ -127,7 +127,7 @@ def _elsewhere(search: Search, effects: tuple[Effect, ...], i: int) -> list[tupl
     """The set with effect i at the two best other places, and at the mirrored places."""
     effect, domain = effects[i], search.rig.modes.domain
 
-    def moved(where: Where, factor: float = 1.0) -> tuple[Effect, ...]:
+    def moved(where: Location, factor: float = 1.0) -> tuple[Effect, ...]:
         values = {**effect.values, **place_values(where)}
         if strength is not None:
             values[strength.name] = float(np.clip(factor * values[strength.name], strength.low, strength.high))
@@ -147,7 +147,7 @@ def _elsewhere(search: Search, effects: tuple[Effect, ...], i: int) -> list[tupl
     return [*(f.effects for f in elsewhere[:2]), *map(moved, _mirrored(effect.at, domain))]
 
 
-def other_places(effect: Effect, domain: Domain) -> Sequence[Where]:
+def other_places(effect: Effect, domain: Domain) -> Sequence[Location]:
     """Places to try instead: a grid of an interval or a rectangle, other named points, or pairs that share a point."""
     if isinstance(domain, Interval):
         return [float(x) for x in domain.length * np.linspace(0.04, 0.96, 13)]
@@ -158,7 +158,7 @@ def other_places(effect: Effect, domain: Domain) -> Sequence[Where]:
     return [name for name in domain.grid() if name != effect.at]
 
 
-def _mirrored(where: Any, domain: Domain) -> list[Where]:
+def _mirrored(where: Any, domain: Domain) -> list[Location]:
     """The mirror images of a place; none for named points."""
     if isinstance(domain, Interval):
         return [domain.length - where]
@@ -236,7 +236,7 @@ def with_equals(
     search: Search,
     best: Fit,
     alternatives: Alternatives,
-    evidence: Evidence,
+    reconstruction: ForceReconstruction,
     alike: Sequence[tuple[str, str, float]],
 ) -> Alternatives:
     """The alternatives of a set, with the equivalent sets that have an effect at another actuator or sensor.
@@ -246,12 +246,12 @@ def with_equals(
 
     Args:
         alternatives: with their probabilities.
-        evidence: of the nominal rig, for start values.
+        reconstruction: of the nominal rig, for start values.
         alike: labels of two effects that the records cannot distinguish, and their correlation.
     """
     data = search.data.finely(SELECTION.fine)
     known = {best.key, *(f.key for f, _ in alternatives)}
-    sets = [s for s in _at_other_ports(search, best, evidence, alike) if key_of(s) not in known]
+    sets = [s for s in _at_other_transducers(search, best, reconstruction, alike) if key_of(s) not in known]
     if not sets:
         return alternatives
     here, *each = search.workers.map(lambda s: fit(search.rig, s, data), [best.effects, *sets])
@@ -267,18 +267,18 @@ def with_equals(
     return tuple(sorted([*beside, *((f, p * own) for f, p in alternatives)], key=lambda each: -each[1]))
 
 
-def _at_other_ports(
-    search: Search, best: Fit, evidence: Evidence, alike: Sequence[tuple[str, str, float]]
+def _at_other_transducers(
+    search: Search, best: Fit, reconstruction: ForceReconstruction, alike: Sequence[tuple[str, str, float]]
 ) -> Iterator[tuple[Effect, ...]]:
     """The sets with one effect replaced by an indistinguishable one at another actuator or sensor."""
-    at_ports = [kind for kind in search.catalogue if kind.path in PORTS]
+    at_transducers = [kind for kind in search.catalogue if kind.path in TRANSDUCERS]
     labels = {
-        Effect(kind, target, {}).label: (kind, target) for kind in at_ports for target in kind.targets(search.rig)
+        Effect(kind, target, {}).label: (kind, target) for kind in at_transducers for target in kind.targets(search.rig)
     }
     for effect in best.effects:
         if effect.label in labels:
             same = dict.fromkeys(label for *pair, _ in alike if effect.label in pair for label in pair)
             for kind, target in (labels[label] for label in same if label in labels and label != effect.label):
-                for values in list(kind.starts(evidence, target))[:1]:
+                for values in list(kind.starts(reconstruction, target))[:1]:
                     other = Effect(kind, target, dict(values))
                     yield tuple(other if e is effect else e for e in best.effects)

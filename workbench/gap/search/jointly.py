@@ -9,7 +9,7 @@ import numpy as np
 from workbench.arrays import Floats, scaled_inverse
 from workbench.gap.effects.effect import Effect, apply_all, can_be, from_other_starts, nearest_possible
 from workbench.gap.effects.nominal import JUST_LATE, NominalPrior, group_of, in_group, nominal_errors, weight_of
-from workbench.gap.effects.ports import SENSOR_DELAY, SENSOR_LAG
+from workbench.gap.effects.transducers import SENSOR_DELAY, SENSOR_LAG
 from workbench.gap.prediction.noise import (
     LEAST_LOGGED,
     are_coloured,
@@ -378,8 +378,8 @@ def with_all_errors(search: Search, found: Fit) -> Fit:
     """The fit with nominal errors of every group, so that intervals allow for each.
 
     Groups that were dropped get the smallest prior standard deviation. The mode shapes have errors at the named points
-    of the effects too: a factor common to all modes there scales an effect, which no record shows. Where the ports have
-    errors of their shapes, all are fitted again together.
+    of the effects too: a factor common to all modes there scales an effect, which no record shows. Where the
+    transducers have errors of their shapes, all are fitted again together.
     """
     errors = next((e for e in found.effects if isinstance(e.target, NominalPrior)), None)
     if errors is None:

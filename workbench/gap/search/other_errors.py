@@ -8,7 +8,7 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import differing, varying_parameters
-from workbench.gap.search.errors_as_effects import PORT_GROUPS
+from workbench.gap.search.errors_as_effects import TRANSDUCER_GROUPS
 from workbench.gap.search.fit import finite_residual
 from workbench.gap.search.jointly import JointFit, fit_from_zero, too_large
 from workbench.gap.search.search import Search
@@ -124,8 +124,8 @@ def with_record_deviations(before: Stepwise) -> Stepwise | None:
     # errors of profiles over-fit errors of single shapes
     if not (with_deviations.has_plausible_errors or search.prior.shape):
         by_mode = Stepwise(replace(varying_search, by_mode=True), before.ahead)
-        # errors of ports and records cannot absorb an effect in the structure
-        if by_mode.is_noise_only and set(too_large(by_mode.last.errors)) <= {"damping", "record", *PORT_GROUPS}:
+        # errors of transducers and records cannot absorb an effect in the structure
+        if by_mode.is_noise_only and set(too_large(by_mode.last.errors)) <= {"damping", "record", *TRANSDUCER_GROUPS}:
             by_mode.run(most=0)
             return by_mode
     noise = nearest.noise_power

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from workbench.gap.effects.effect import Effect, each_left_out
-from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.localisation.force_reconstruction import ForceReconstruction
 from workbench.gap.search.finish import finished, plainest, ranked, relocated, simplest, simplified
 from workbench.gap.search.fit import Fit, cost_of
 from workbench.gap.search.screening import Screening, fitted_ahead, on_whole_records, one_more
@@ -82,18 +82,18 @@ class Pairs:
         if pair.cost - 1.0 > most:
             return False
         search.progress("three effects at once", 0.45)
-        three = one_more(search, pair.effects, search.evidence_with(pair.effects))
+        three = one_more(search, pair.effects, search.reconstruction_with(pair.effects))
         if not three or three[0].cost - 1.0 > PAIRS.nearer * (pair.cost - 1.0):
             return False
         for two in list(each_left_out(three[0].effects)):
-            three = [*three, *one_more(search, two, search.evidence_with(two))]
+            three = [*three, *one_more(search, two, search.reconstruction_with(two))]
         return self._add_and_check(sorted(three, key=lambda f: f.cost))
 
     def _explained_with_one_more(self, given: tuple[Effect, ...]) -> bool:
         """Whether these effects with one more explain the records."""
         if self.search.is_over:
             return False
-        return self._add_and_check(one_more(self.search, given, self.search.evidence_with(given)))
+        return self._add_and_check(one_more(self.search, given, self.search.reconstruction_with(given)))
 
     def by_exchange(self) -> bool:
         """Whether a pair with either half of the best one-step-ahead pair explains the records.
@@ -120,7 +120,7 @@ class Pairs:
             return False
         self.search.progress(f"{effect.kind.words} and a second effect", 0.55 + 0.05 * min(len(self.given), 8))
         self.given = [*self.given, effect]
-        return self._add_and_check(one_more(self.search, (effect,), _evidence_with(self.search, effect)))
+        return self._add_and_check(one_more(self.search, (effect,), _reconstruction_with(self.search, effect)))
 
     def decision(self, start: Fit) -> Decision:
         """The decision based on the pairs; `start` is the fit without effects."""
@@ -174,10 +174,10 @@ class Pairs:
         self.found = sorted((*pairs, *self.found), key=lambda f: f.cost)
 
 
-def _evidence_with(search: Search, effect: Effect) -> Evidence:
-    """Evidence of the rig with the effect, or without it if the simulation diverges with this effect alone."""
+def _reconstruction_with(search: Search, effect: Effect) -> ForceReconstruction:
+    """The force reconstructed with the effect, or without it if the simulation diverges with this effect alone."""
     astray = cost_of(search.rig, (effect,), search.data) > PAIRS.astray * search.nominal.mean()
-    return search.evidence_with(() if astray else (effect,))
+    return search.reconstruction_with(() if astray else (effect,))
 
 
 def _by_contribution(search: Search, found: Fit) -> list[Effect]:

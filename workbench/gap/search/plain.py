@@ -8,7 +8,7 @@ import numpy as np
 
 from workbench.gap.effects.effect import Effect, contained, each_left_out, simpler_sets
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, in_group
-from workbench.gap.effects.ports import SENSOR_DELAY
+from workbench.gap.effects.transducers import SENSOR_DELAY
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.search.errors_as_effects import (
     DELAYS_OF_ALL,
@@ -33,7 +33,7 @@ from workbench.rig.rig import Rig
 def in_place_of_nominal_errors(
     search: Search, step: JointFit, alternatives: Sequence[tuple[Effect, ...]] = ()
 ) -> Fit | None:
-    """A set of few effects that explains the records with no nominal errors but uniform ones and those of ports.
+    """A set of few effects that explains the records with no nominal errors but uniform ones and those of transducers.
 
     Such a set needs fewer parameters than nominal errors of every mode or wave. None if there is none, or if the
     records surely prefer plausible nominal errors.
@@ -41,25 +41,29 @@ def in_place_of_nominal_errors(
     Args:
         search: with the noise estimated jointly with the nominal errors.
         step: effects and nominal errors fitted jointly; the delays of sensors are kept, and the gains and places of
-            ports where nothing explains the records without.
+            transducers where nothing explains the records without.
         alternatives: other sets that explain the records with nominal errors, which can hide a wrong place or law.
     """
     if step.errors.target.record:  # no effect varies from record to record
         return None
-    candidates = (_with_port_errors(search, step, alternatives, kept) for kept in _at_ports(step.errors))
+    candidates = (_with_transducer_errors(search, step, alternatives, kept) for kept in _at_transducers(step.errors))
     return next((found for found in candidates if found is not None), None)
 
 
-def _with_port_errors(
+def _with_transducer_errors(
     search: Search, step: JointFit, alternatives: Sequence[tuple[Effect, ...]], kept: tuple[Effect, ...]
 ) -> Fit | None:
-    """The same as `in_place_of_nominal_errors`, given the errors of ports (`kept`) that stay."""
+    """The same as `in_place_of_nominal_errors`, given the errors of transducers (`kept`) that stay."""
     effects = step.effects
     named = {effect.kind for effect in effects}
     common = tuple(effect for effect in NO_UNIFORM_ERROR if effect.kind not in named)
-    at_ports = [ports for ports in _with_common_causes(search.rig, kept) if named.isdisjoint(e.kind for e in ports)]
+    at_transducers = [
+        transducers
+        for transducers in _with_common_causes(search.rig, kept)
+        if named.isdisjoint(e.kind for e in transducers)
+    ]
     if not effects:
-        both = _simplest_explaining(search, [(*common, *ports) for ports in at_ports], step)
+        both = _simplest_explaining(search, [(*common, *transducers) for transducers in at_transducers], step)
         if both is not None and {SENSOR_DELAY, *DELAYS_OF_ALL} & {effect.kind for effect in both.effects}:
             return both  # a delay of one sensor, or of all, is an effect even with uniform errors
         # with input noise that an effect made seem louder, uniform errors may explain too much
@@ -72,7 +76,7 @@ def _with_port_errors(
     if len(effects) > 1:  # without nominal errors, an effect may be unnecessary or a limiting case suffice
         fewer = list(each_left_out(effects))
         sets += [*fewer, *(s for given in (effects, *fewer) for s in simpler_sets(given, search.rig))]
-    found = _simplest_explaining(search, [(*s, *ports) for s in sets for ports in at_ports], step)
+    found = _simplest_explaining(search, [(*s, *transducers) for s in sets for transducers in at_transducers], step)
     return found or _with_one_linear_effect(search, (*effects, *kept), common, step)
 
 
@@ -90,7 +94,7 @@ def _one_uniform_error(
     return min(alone, key=lambda f: f.cost, default=None)
 
 
-def _at_ports(errors: Effect) -> Iterator[tuple[Effect, ...]]:
+def _at_transducers(errors: Effect) -> Iterator[tuple[Effect, ...]]:
     """The nominal errors restricted to sensor delays, then to delays, gains and places; empty if there are none."""
     prior = errors.target
     sides = {"late": prior.late, "early": prior.early, "interpolated": prior.interpolated}
@@ -103,7 +107,7 @@ def _at_ports(errors: Effect) -> Iterator[tuple[Effect, ...]]:
 
 
 def _with_common_causes(rig: Rig, kept: tuple[Effect, ...]) -> Iterator[tuple[Effect, ...]]:
-    """The errors of ports, then each single effect that may be the common cause of all their delays."""
+    """The errors of transducers, then each single effect that may be the common cause of all their delays."""
     yield kept
     if len(kept) == 1 and kept[0].target.groups == ("delay",):
         yield from ((effect,) for effect in delay_effects(rig, kept[0]) if effect.kind in DELAYS_OF_ALL)
@@ -185,7 +189,7 @@ def few_with_uniform_errors(search: Search, step: JointFit, most: int) -> Fit | 
     """At most `most` effects that explain the records, added one by one to uniform stiffness and damping errors.
 
     None if an effect does not halve the residual, on whole records or one step ahead, or is a plausible error of a
-    port. Nominal errors of every mode or wave would absorb strong effects that are still missing, and cost more time.
+    transducer. Nominal errors of every mode or wave would absorb strong effects still missing, and cost more time.
 
     Args:
         step: nominal errors that do not explain the records, or are implausible.
@@ -194,7 +198,7 @@ def few_with_uniform_errors(search: Search, step: JointFit, most: int) -> Fit | 
     for _ in range(most):
         if search.is_over:
             return None
-        ahead = one_more(search, best.effects, search.evidence_with(best.effects))
+        ahead = one_more(search, best.effects, search.reconstruction_with(best.effects))
         fits = on_whole_records(search, ahead, PAIRS.more)
         if not fits:
             return None
@@ -232,7 +236,9 @@ def _with_one_linear_effect(
     if not search.logged and start.cost < 1.0 + STEPWISE.no_gap:
         return None
     given = start.effects
-    screened = Screening.of(replace(search, catalogue=linear_kinds), given, search.evidence_with(given)).likeliest()
+    screened = Screening.of(
+        replace(search, catalogue=linear_kinds), given, search.reconstruction_with(given)
+    ).likeliest()
     likeliest = first_of_each(screened, lambda effect: effect.kind)[: PLAIN.likeliest]
     beside = tuple(dict.fromkeys(((), common)))
     sets = [(*given, effect, *some) for effect in likeliest for some in beside]

@@ -10,7 +10,7 @@ import numpy as np
 from workbench.arrays import Flags, Floats
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import ALL, Effect, Kind, apply_all, contained
-from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.localisation.force_reconstruction import ForceReconstruction
 from workbench.gap.search.fit import Fit, cost_of, finite_residual, fit, slopes
 from workbench.gap.search.search import Search, apart, best_of_each_kind, in_one_minimum, promise
 from workbench.gap.search.settings import SCREENING, SEARCH, SELECTION
@@ -46,15 +46,15 @@ class Screening:
     domain: Domain
 
     @classmethod
-    def of(cls, search: Search, given: tuple[Effect, ...], evidence: Evidence) -> "Screening":
-        """Screen all effects that may be present beside the given ones; the evidence is of the rig with these."""
+    def of(cls, search: Search, given: tuple[Effect, ...], reconstruction: ForceReconstruction) -> "Screening":
+        """Screen all effects that may be present beside the given ones; the reconstruction is with these."""
         data, unprojected = search.first_ahead, search.first_ahead.unprojected
         before = finite_residual(search.rig, (*given, *search.held), unprojected)
         if before is None:
             return cls((), np.zeros((0, 0)), np.zeros(0), np.zeros(0), np.zeros(0), search.rig.modes.domain)
         every = slice(None, None, max(1, before.size // SCREENING.most_values))
 
-        starts = _starts(search, given, evidence)
+        starts = _starts(search, given, reconstruction)
         left = before.copy()
         data.project_out(left)
         left = left[every]
@@ -161,7 +161,7 @@ def _bounds(start: Effect) -> tuple[float, float]:
     return (-SCREENING.stronger if start.kind.signed else SCREENING.weaker), SCREENING.stronger
 
 
-def _starts(search: Search, given: tuple[Effect, ...], evidence: Evidence) -> list[Effect]:
+def _starts(search: Search, given: tuple[Effect, ...], reconstruction: ForceReconstruction) -> list[Effect]:
     """Start values of every kind and target that may join the given effects, grouped by kind and target."""
     left = search.data.by_channel(search.data.residual(apply_all(search.rig, (*given, *search.held))))
     starts = [
@@ -169,7 +169,7 @@ def _starts(search: Search, given: tuple[Effect, ...], evidence: Evidence) -> li
         for kind in search.catalogue
         if kind.found_in == "search"
         for target in _plausible_targets(kind, search.rig, left)
-        for values in kind.starts(evidence, target)
+        for values in kind.starts(reconstruction, target)
     ]
     return [start for start in starts if not any(_duplicates(start, effect) for effect in given)]
 
@@ -199,15 +199,15 @@ def _duplicates(one: Effect, other: Effect) -> bool:
 
 
 def one_more(
-    search: Search, given: tuple[Effect, ...], evidence: Evidence, screened: Screening | None = None
+    search: Search, given: tuple[Effect, ...], reconstruction: ForceReconstruction, screened: Screening | None = None
 ) -> list[Fit]:
     """The best fits of the given effects with one more to one-step-ahead predictions, best first.
 
     Args:
-        evidence: of the rig with the given effects.
+        reconstruction: of the rig with the given effects.
         screened: the screening with these effects given, if it is available.
     """
-    screened = Screening.of(search, given, evidence) if screened is None else screened
+    screened = Screening.of(search, given, reconstruction) if screened is None else screened
     chosen: list[Effect] = []
     for effect in screened.likeliest():
         if sum(effect.kind is other.kind for other in chosen) < SELECTION.targets_a_kind:
@@ -221,19 +221,21 @@ def one_more(
 
 
 def _at_likely_places(found: Sequence[Fit], screened: Screening) -> list[Effect]:
-    """Linear structural kinds at the places of the best other ones, and other faults of the likeliest port."""
+    """Linear structural kinds at the places of the best other ones, and other faults of the likeliest transducer."""
 
     def is_linear(effect: Effect) -> bool:
         return effect.kind.path == "structure" and not effect.kind.nonlinear and effect.at is not None
 
     starts, best = screened.likeliest(), found[0].effects[-1]
-    of_port = [e for e in starts if isinstance(e.target, str) and e.target == best.target and e.kind is not best.kind]
+    of_transducer = [
+        e for e in starts if isinstance(e.target, str) and e.target == best.target and e.kind is not best.kind
+    ]
     if isinstance(screened.domain, NamedPoints):
-        return of_port
+        return of_transducer
     likeliest = [f.effects[-1] for f in best_of_each_kind(found) if is_linear(f.effects[-1])][: SELECTION.exchanged]
     linear = {effect.kind: effect for effect in reversed(starts) if is_linear(effect)}
     there = [e.moved_to(one.at) for one in likeliest for e in linear.values() if e.kind is not one.kind]
-    return [*there, *of_port]
+    return [*there, *of_transducer]
 
 
 def fitted_ahead(search: Search, sets: Sequence[tuple[Effect, ...]]) -> list[Fit]:

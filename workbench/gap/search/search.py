@@ -10,7 +10,7 @@ import numpy as np
 
 from workbench.gap.effects.effect import Effect, Kind, apply_all, can_be
 from workbench.gap.effects.nominal import STIFFNESS, NominalPrior
-from workbench.gap.localisation.evidence import FEWER_PLACES, Evidence
+from workbench.gap.localisation.force_reconstruction import FEWER_PLACES, ForceReconstruction
 from workbench.gap.prediction.innovations import LOOSE, Observer
 from workbench.gap.prediction.noise import input_filters, logging_noise_power, noise_found
 from workbench.gap.prediction.random_force import RandomForceFit
@@ -44,7 +44,7 @@ class Search:
         held: fixed effects that are added to every candidate.
         logged: input noise, as a share of the inputs' rms, that the residuals are whitened for; 0 for none.
         differs: the nominal parameter that varies from record to record; empty for none.
-        by_mode: whether nominal errors are those of each mode (its frequency, its shape at every port) instead of
+        by_mode: whether nominal errors are those of each mode (its frequency, its shape at every transducer) instead of
             smooth variations of mass and stiffness.
         tolerance: of the signal's rms: neither a gap nor an effect that is smaller in every record counts.
         loose: process noise of the observer that predicts one step ahead, of the inputs' rms.
@@ -192,9 +192,9 @@ class Search:
         """The same search with each of its selections of records changed."""
         return replace(self, data=changed(self.data), quick=changed(self.quick), first=changed(self.first))
 
-    def evidence_with(self, effects: Sequence[Effect]) -> Evidence:
-        """Evidence of a force that the rig with effects lacks."""
-        return Evidence.of(apply_all(self.rig, effects), self.data, FEWER_PLACES, self.workers)
+    def reconstruction_with(self, effects: Sequence[Effect]) -> ForceReconstruction:
+        """The force that the rig with effects lacks."""
+        return ForceReconstruction.of(apply_all(self.rig, effects), self.data, FEWER_PLACES, self.workers)
 
     def without_clipped(self) -> "Search":
         """The same search without sensors that clip or round coarsely, whose errors would pass for a force."""

@@ -1,4 +1,4 @@
-"""Constants of the search for effects, one class for each step that reads them, with units and evidence."""
+"""Constants of the search for effects, one class for each step that reads them, with units and reconstruction."""
 
 from dataclasses import dataclass
 
@@ -168,7 +168,7 @@ class ErrorSettings:
     outlying: float = 4.0
     most_moved: float = 0.01  # of the extent: an actuator or sensor that is farther off its place is an effect
     suspect: float = 0.4  # of most_gain and most_moved: larger errors are tested, since one that is wrong biases others
-    wrong_ports: int = 2  # gains and places that are tested
+    wrong_transducers: int = 2  # gains and places that are tested
     wide: float = 2.0  # standard errors: an effect whose interval reaches the errors of a careful model may be one
 
 

@@ -8,10 +8,9 @@ import numpy as np
 
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nonlinear import BEYOND, any_beyond, in_catalogue
-from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.localisation.where import of_one_sensor
+from workbench.gap.localisation.breakdown import of_one_sensor
+from workbench.gap.localisation.force_reconstruction import ForceReconstruction
 from workbench.gap.prediction.noise import is_noise_alone, noise_found
-from workbench.gap.search.beside_random import decide_on_random, random_with_effects, random_with_nominal_errors
 from workbench.gap.search.errors_as_effects import NO_UNIFORM_ERROR, UNIFORM, are_uniform_errors, is_plausible_error
 from workbench.gap.search.finish import finished, ranked, relocated, simplest
 from workbench.gap.search.fit import Fit, cost_of, fit
@@ -22,6 +21,7 @@ from workbench.gap.search.screening import Screening, on_whole_records, one_more
 from workbench.gap.search.search import Decision, Search, most_informative, nearest, promise
 from workbench.gap.search.settings import ATTRIBUTION, PAIRS, RANDOM, SEARCH, SELECTION, STEPWISE
 from workbench.gap.search.stepwise import Stepwise
+from workbench.gap.search.with_random_force import decide_on_random, random_with_effects, random_with_nominal_errors
 from workbench.rig.simulate import is_stepped
 
 
@@ -35,8 +35,8 @@ class Stages:
     Attributes:
         search: records, rig with the effects seen in the readings, and candidate kinds.
         start: the fit without further effects.
-        evidence: of that rig.
-        nominal: evidence of the nominal rig.
+        reconstruction: of that rig.
+        nominal: the force reconstructed with the nominal rig.
         uncertain_nominal: whether nominal errors are fitted with every effect from the first.
         ahead: single effects fitted to one-step-ahead predictions, best first; empty if a stage before decides.
         singles: single effects on whole records, best first, or sets that were tried with a random disturbance.
@@ -46,8 +46,8 @@ class Stages:
 
     search: Search
     start: Fit
-    evidence: Evidence
-    nominal: Evidence
+    reconstruction: ForceReconstruction
+    nominal: ForceReconstruction
     uncertain_nominal: bool = False
     ahead: list[Fit] = field(default_factory=list)
     singles: list[Fit] = field(default_factory=list)
@@ -59,7 +59,7 @@ class Stages:
         early = _first_of(BEFORE_SINGLES, self)
         if early is not None:
             return early
-        self.ahead = one_more(self.search, (), self.evidence, self.screened)
+        self.ahead = one_more(self.search, (), self.reconstruction, self.screened)
         self.singles = self._singles_on_whole_records()
         found = _first_of(STAGES, self) or self.nearest_set()
         return found if self.missing else nearest(self.search, self.start, found, self.singles)
@@ -72,7 +72,7 @@ class Stages:
 
     def noise_alone(self) -> Decision | None:
         """More noise than stated."""
-        residuals = self.evidence.residuals
+        residuals = self.reconstruction.residuals
         if self.is_explained_by_none or not is_noise_alone(residuals, self.search.data.counted):
             return None
         return Decision("none", self.start, noise=noise_found(residuals))
@@ -92,7 +92,7 @@ class Stages:
         """A random disturbance of the structure, alone or with few effects."""
         if self.is_explained_by_none or self._is_of_one_sensor:
             return None
-        found, self.singles = decide_on_random(self.search, self.evidence)
+        found, self.singles = decide_on_random(self.search, self.reconstruction)
         return found
 
     # From single effects on
@@ -100,11 +100,11 @@ class Stages:
     def single_effect(self) -> Decision | None:
         """At most one effect."""
         found, self.singles = _decide_on_singles(self.search, self.start, self.singles)
-        return None if found is None else _unless_other_law(self.search, found, self.evidence)
+        return None if found is None else _unless_other_law(self.search, found, self.reconstruction)
 
     def random_at_one_sensor(self) -> Decision | None:
         """A random disturbance that only one sensor shows, whose own faults do not explain it."""
-        return decide_on_random(self.search, self.evidence)[0] if self._is_of_one_sensor else None
+        return decide_on_random(self.search, self.reconstruction)[0] if self._is_of_one_sensor else None
 
     def pair_at_noise_floor(self) -> Decision | None:
         """Two effects, with the stated sensor noise.
@@ -165,18 +165,18 @@ class Stages:
             return None
         if self.is_explained_by_one_beside_errors:
             return None
-        evidence = self.evidence.of_rig(apply_all(search.rig, missing))
+        reconstruction = self.reconstruction.of_rig(apply_all(search.rig, missing))
         quick, first = most_informative(search.data, best.cost_by_channel)
         with_them = replace(
             search,
-            rig=evidence.rig,
+            rig=reconstruction.rig,
             quick=quick,
             first=first,
             catalogue=tuple(kind for kind in search.catalogue if not kind.adds_modes),
             nominal=best.cost_by_channel,
         )
         start = replace(best, effects=(), n_parameters=0)
-        self.missing, self.beside_missing = missing, Stages(with_them, start, evidence, evidence)
+        self.missing, self.beside_missing = missing, Stages(with_them, start, reconstruction, reconstruction)
         return self.beside_missing.decision()
 
     def random_beside_effects(self) -> Decision | None:
@@ -201,7 +201,7 @@ class Stages:
 
     def other_law(self) -> Decision | None:
         """A force at one point of a law beyond the catalogue: takes a second, where deviations take minutes."""
-        law = None if self.search.is_over else _force_of_other_law(self.search, self.evidence)
+        law = None if self.search.is_over else _force_of_other_law(self.search, self.reconstruction)
         return None if law is None else _law_or_decision(law, self.search, self.pairs.decision(self.start))
 
     def record_deviations(self) -> Decision | None:
@@ -269,7 +269,7 @@ class Stages:
     def screened(self) -> Screening:
         """All kinds of effects, screened with none given."""
         self.search.progress("one effect", 0.1)
-        return Screening.of(self.search, (), self.evidence)
+        return Screening.of(self.search, (), self.reconstruction)
 
     def _singles_on_whole_records(self) -> list[Fit]:
         """Single effects on whole records, best first."""
@@ -389,20 +389,20 @@ def _finished_best(search: Search, fits: Sequence[Fit]) -> list[Fit]:
     return [*search.in_parallel(finished, promising), *(f for f in fits if f not in promising)]
 
 
-def _force_of_other_law(search: Search, evidence: Evidence) -> Fit | None:
+def _force_of_other_law(search: Search, reconstruction: ForceReconstruction) -> Fit | None:
     """A force at one point that explains the records alone, with a law beyond the catalogue or a power law in it.
 
     Two effects at one place can fit many laws, so this comes before pairs are accepted. None if there is none.
     """
     search.progress("one force of a law beyond the catalogue", 0.35)
-    fits = _forces_of_other_laws(search, evidence, SELECTION.promising)
+    fits = _forces_of_other_laws(search, reconstruction, SELECTION.promising)
     return next((f for f in (_as_catalogue_kind(search, f) for f in fits) if search.explains(f)), None)
 
 
-def _forces_of_other_laws(search: Search, evidence: Evidence, most: float) -> list[Fit]:
+def _forces_of_other_laws(search: Search, reconstruction: ForceReconstruction, most: float) -> list[Fit]:
     """Forces at one point of a law beyond the catalogue, best first, that cost less than `most` one step ahead."""
     beyond = replace(search, catalogue=BEYOND)
-    promising = [f for f in one_more(beyond, (), evidence) if f.cost < most]
+    promising = [f for f in one_more(beyond, (), reconstruction) if f.cost < most]
     return on_whole_records(beyond, promising, ATTRIBUTION.laws, to_cost=search.cost_limit)
 
 
@@ -412,12 +412,12 @@ def _as_catalogue_kind(search: Search, law: Fit) -> Fit:
     return law if known is None else finished(search, fit(search.rig, (known,), search.data))
 
 
-def _unless_other_law(search: Search, decision: Decision, evidence: Evidence) -> Decision:
+def _unless_other_law(search: Search, decision: Decision, reconstruction: ForceReconstruction) -> Decision:
     """The decision, or that for a law beyond the catalogue if the records surely prefer it to one law at a point.
 
     Args:
         decision: to be compared.
-        evidence: of the nominal rig.
+        reconstruction: of the nominal rig.
     """
     best = decision.best
     if decision.outcome != "explained" or len(best.effects) != 1:
@@ -427,7 +427,7 @@ def _unless_other_law(search: Search, decision: Decision, evidence: Evidence) ->
         return decision
     search.progress("one force of a law beyond the catalogue", 0.9)
     as_near = cost_of(search.rig, best.effects, search.ahead) + SEARCH.alternative
-    fits = _forces_of_other_laws(search, evidence.of_force_at(effect.at), as_near)
+    fits = _forces_of_other_laws(search, reconstruction.of_force_at(effect.at), as_near)
     other = [f for f in fits if in_catalogue(f.effects[0]) is None]
     sure = (f for f in other if search.explains(f) and search.surely_better(f, best.cost, best.n_parameters))
     law = next(sure, None)

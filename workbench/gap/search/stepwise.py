@@ -8,7 +8,7 @@ import numpy as np
 
 from workbench.gap.effects.effect import Effect, Kind, apply_all, contained, key_of, more_general_sets
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, in_group, nominal_errors
-from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.localisation.force_reconstruction import ForceReconstruction
 from workbench.gap.prediction.noise import LEAST_LOGGED
 from workbench.gap.search.elimination import (
     backward_eliminated,
@@ -23,13 +23,13 @@ from workbench.gap.search.errors_as_effects import (
     UNIFORM,
     is_linear_structural,
     is_timing,
-    may_be_port_errors,
+    may_be_transducer_errors,
     with_delay_as_effect,
     with_late_accelerometer,
     with_uniform_effects,
-    with_wrong_ports,
+    with_wrong_transducers,
 )
-from workbench.gap.search.finish import PORTS, other_places
+from workbench.gap.search.finish import TRANSDUCERS, other_places
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.jointly import (
     TIMING,
@@ -50,7 +50,7 @@ from workbench.gap.search.screening import fitted_ahead, one_more
 from workbench.gap.search.search import Alternatives, Decision, Search, apart, best_of_each_kind, most_informative
 from workbench.gap.search.settings import FINISH, INPUTS, PLAIN, SEARCH, SELECTION, STEPWISE
 from workbench.rig.simulate import is_stepped
-from workbench.structure.domain import Where
+from workbench.structure.domain import Location
 
 
 class Stepwise:
@@ -157,7 +157,7 @@ class Stepwise:
         sets = [f.effects for f in self._likeliest_singles()] if self.singles is None else self.singles
         keys = {key_of(step.effects) for step in self.known}
         fresh = self.search.in_parallel(fit_from_zero, [effects for effects in sets if key_of(effects) not in keys])
-        found = [s for s in (*self.known, *fresh) if not may_be_port_errors(self.search, s.effects)]
+        found = [s for s in (*self.known, *fresh) if not may_be_transducer_errors(self.search, s.effects)]
         # one step ahead without nominal errors, the true law may come after errors of gain and place
         nearest = min(found, key=lambda s: s.fit.cost, default=None)
         another = nearest and (self._with_another_law(nearest) or self._with_law_elsewhere(nearest))
@@ -197,7 +197,7 @@ class Stepwise:
                 chosen.append(single)
         chosen = [f for f in chosen[: STEPWISE.singles] if f.cost < STEPWISE.near * chosen[0].cost]
         # nominal errors may have absorbed an effect, so the best ones without nominal errors are tried too
-        alone = [f for f in self.ahead[:1] if not may_be_port_errors(search, f.effects)]
+        alone = [f for f in self.ahead[:1] if not may_be_transducer_errors(search, f.effects)]
         for single in (*linear[:1], *alone):
             tried = {other.key for other in chosen}
             if single.effects[0].kind not in UNIFORM and not tried & {
@@ -318,7 +318,7 @@ class Stepwise:
             return False
         errors = with_reading_sides(search, nominal_errors(search.rig, search.prior), best.effects)
         found = fit_jointly(search, best.effects, errors, until_convergence=True)
-        if may_be_port_errors(search, found.effects) or not found.explains:
+        if may_be_transducer_errors(search, found.effects) or not found.explains:
             return False
         if not search.are_noticeable(found.effects, found.fit.effects):
             return False
@@ -368,7 +368,7 @@ class Stepwise:
             return
         sets = [f.effects for f in self._linear_singles[: STEPWISE.finalists]]
         fitted = self.search.in_parallel(fit_from_zero, sets)
-        tried = [s for s in fitted if s.is_plausible and not may_be_port_errors(self.search, s.effects)]
+        tried = [s for s in fitted if s.is_plausible and not may_be_transducer_errors(self.search, s.effects)]
         shorter = [s for s in tried if s.description(noise) < length_limit]
         if not shorter:
             return
@@ -441,7 +441,7 @@ class Stepwise:
         return self._exchanged(step, (effect.kind,), None, lambda e: apart(e, effect, domain))
 
     def _exchanged(
-        self, step: JointFit, kinds: tuple[Kind, ...], at: Where | None, is_tried: Callable[[Effect], bool]
+        self, step: JointFit, kinds: tuple[Kind, ...], at: Location | None, is_tried: Callable[[Effect], bool]
     ) -> JointFit | None:
         """The step with its one law exchanged for a likelier one at a point, beside its errors, or None.
 
@@ -454,10 +454,10 @@ class Stepwise:
         search = self.search
         search.progress("another law, or the same at other places", 0.6)
         with_errors = replace(search.with_nominal_errors(step.errors), catalogue=kinds)
-        evidence = Evidence.of(
+        reconstruction = ForceReconstruction.of(
             apply_all(search.rig, (step.errors,)), search.data, workers=search.workers, absorbed=True
         )
-        ahead = one_more(with_errors, (), evidence if at is None else evidence.of_force_at(at))
+        ahead = one_more(with_errors, (), reconstruction if at is None else reconstruction.of_force_at(at))
         key = key_of(step.effects)
         others = [
             f
@@ -537,8 +537,8 @@ class Stepwise:
             with_errors = replace(with_errors, loose=loose)
             cost = cost_of(search.rig, step.fit.effects, with_errors.ahead)
         rig = apply_all(search.rig, step.fit.effects)
-        evidence = Evidence.of(rig, search.data, workers=search.workers, absorbed=True)
-        ahead = one_more(with_errors, step.effects, evidence)
+        reconstruction = ForceReconstruction.of(rig, search.data, workers=search.workers, absorbed=True)
+        ahead = one_more(with_errors, step.effects, reconstruction)
         if not ahead or ahead[0].cost > (1.0 - STEPWISE.ahead) * cost:
             return []
         promising, as_good = (cost - share * (cost - ahead[0].cost) for share in (STEPWISE.promising, STEPWISE.as_good))
@@ -555,11 +555,11 @@ class Stepwise:
         # the single effects fitted before nominal errors could absorb them compete too
         singles = [] if step.effects else self.fitted_singles
         search = self.search
-        tried = sorted((s for s in tried if not may_be_port_errors(search, s.effects)), key=partial(loss, search))
+        tried = sorted((s for s in tried if not may_be_transducer_errors(search, s.effects)), key=partial(loss, search))
         near = _finalists(tried, STEPWISE.near * tried[0].fit.cost) if tried else []
         whole = search.workers.map(lambda s: without_inactive(search, fitted_to_all(search, s)), near)
         # the most informative records overstate some
-        whole = [s for s in whole if not may_be_port_errors(search, s.effects)]
+        whole = [s for s in whole if not may_be_transducer_errors(search, s.effects)]
         whole = sorted((*whole, *singles), key=partial(loss, search))
         return self._simplest(whole[0], whole[1:]) if whole else step
 
@@ -614,7 +614,7 @@ class Stepwise:
 
     def calibrate(self) -> bool:
         """Turn errors of gain and place too large for a careful laboratory into effects; True if there are any."""
-        found = self.last if self.search.is_over else with_wrong_ports(self.search, self.last)
+        found = self.last if self.search.is_over else with_wrong_transducers(self.search, self.last)
         if found is self.last:
             return False
         # a lag of all channels weakens what is quick, which a gain may stand for
@@ -659,7 +659,9 @@ class Stepwise:
 
     def _in_place_of_inputs(self, step: JointFit) -> JointFit | None:
         """The step with one more effect that explains the records without input noise, or None."""
-        tried = [s for s in self._candidates_with_one_more(step) if not may_be_port_errors(self.search, s.effects)]
+        tried = [
+            s for s in self._candidates_with_one_more(step) if not may_be_transducer_errors(self.search, s.effects)
+        ]
         near = _finalists(sorted(tried, key=lambda s: s.fit.cost), PLAIN.near)
         whole = self.search.in_parallel(fitted_to_all, near)
         found = [s for s in whole if s.explains and s.is_plausible and self._is_accepted(s, step)]
@@ -757,7 +759,7 @@ class Stepwise:
 def _law_of(step: JointFit) -> Effect | None:
     """The nonlinear law of the structure that is the one effect of a step, or None."""
     effect = step.effects[0] if len(step.effects) == 1 else None
-    return effect if effect is not None and effect.kind.nonlinear and effect.kind.path not in PORTS else None
+    return effect if effect is not None and effect.kind.nonlinear and effect.kind.path not in TRANSDUCERS else None
 
 
 def _finalists(steps: Sequence[JointFit], cost_limit: float) -> list[JointFit]:

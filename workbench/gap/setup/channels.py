@@ -57,7 +57,7 @@ def channel_faults(gap: Comparison, kinds: Collection[str]) -> list[SetupFault]:
     """The most probable certain fault, of all outputs or of channels that share it; else all that are in doubt.
 
     Args:
-        gap: measured and predicted outputs.
+        gap: measured and simulated outputs.
         kinds: kinds of candidates that may be accepted.
     """
     n = len(gap.rig.sensors)
@@ -124,35 +124,35 @@ def accepted(gap: Comparison) -> list[Candidate]:
 
 def _candidates(gap: Comparison) -> Iterator[Candidate]:
     """Every candidate fault of one input, one output with a wide gap, two exchanged ones, and all outputs alike."""
-    rig, measured, predicted = gap.rig, gap.measured_spectra, gap.predicted_spectra
+    rig, measured, simulated = gap.rig, gap.measured_spectra, gap.simulated_spectra
     n, wide = len(rig.sensors), [int(j) for j in np.flatnonzero(gap.wide)]
     for factor in FACTORS:
-        misfit = band_misfit(measured, predicted, factor)
+        misfit = band_misfit(measured, simulated, factor)
         yield Candidate("outputs", factor, tuple(range(n)), misfit)
         for j in wide if n > 1 else ():
             yield Candidate("outputs", factor, (j,), gap.misfit_with((j,), misfit[:, [j]]))
     for i, j in combinations(wide, 2):
-        misfit = band_misfit(measured.select((i, j)), predicted.select((j, i)))
+        misfit = band_misfit(measured.select((i, j)), simulated.select((j, i)))
         names = rig.sensors[i].name, rig.sensors[j].name
         yield Candidate("exchanged outputs", names, (i, j), gap.misfit_with((i, j), misfit))
     for quantity in QUANTITIES:
         others = [j for j in wide if rig.sensors[j].quantity in set(QUANTITIES) - {quantity}]
         if others:
             with_quantity = relabelled(rig, [rig.sensors[j].name for j in others], quantity)
-            misfit = band_misfit(measured, gap.spectra_of(gap.predict(with_quantity, gap.records)))
+            misfit = band_misfit(measured, gap.spectra_of(gap.simulated_with(with_quantity, gap.records)))
             for j in others:
                 stated_and_true = (rig.sensors[j].quantity, quantity)
                 yield Candidate("quantity", stated_and_true, (j,), gap.misfit_with((j,), misfit[:, [j]]))
     for p, alone in enumerate(gap.by_input):
         own = gap.spectra_of(alone)
         for factor in (*FACTORS, 0.0) if any(np.any(lines) for lines in own.lines) else ():
-            lines = [every + (factor - 1.0) * part for every, part in zip(predicted.lines, own.lines, strict=True)]
-            yield Candidate("inputs", factor, (p,), band_misfit(measured, predicted.with_lines(lines)))
+            lines = [every + (factor - 1.0) * part for every, part in zip(simulated.lines, own.lines, strict=True)]
+            yield Candidate("inputs", factor, (p,), band_misfit(measured, simulated.with_lines(lines)))
     m = len(rig.actuators)
     for p, q in combinations(range(m), 2):
         if m <= MOST_CHANNELS or q == p + 1:
             names = rig.actuators[p].name, rig.actuators[q].name
-            crossed = gap.spectra_of(gap.predict(*exchanged("inputs", *names, rig, gap.records)))
+            crossed = gap.spectra_of(gap.simulated_with(*exchanged("inputs", *names, rig, gap.records)))
             yield Candidate("exchanged inputs", names, (p, q), band_misfit(measured, crossed))
 
 
@@ -198,7 +198,7 @@ def _is_certain(gap: Comparison, candidate: Candidate) -> bool | None:
     if candidate.value in (G, 1.0 / G) and gap.rig.sensors[j].quantity != "acceleration":
         return None
     with_factor, with_gain = (
-        gap.residual_power([by * p for p in gap.predicted]) for by in (factor, gap.gains[:, None])
+        gap.residual_power([by * p for p in gap.simulated]) for by in (factor, gap.gains[:, None])
     )
     if gap.closed(with_factor)[j] < CLOSED:
         return None
@@ -213,7 +213,7 @@ def _rests_on_one_mode(gap: Comparison, factor: float, affected: Flags | bool) -
     gives it any gain.
 
     Args:
-        gap: measured and predicted outputs.
+        gap: measured and simulated outputs.
         factor: of the fault.
         affected: (n_records, n_outputs, n_modes) bands whose misfit the correction changes; True for all.
     """

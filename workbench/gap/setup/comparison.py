@@ -1,4 +1,4 @@
-"""Comparison of records with the predictions of a rig, in frequency bands of one mode each."""
+"""Comparison of records with the simulations of a rig, in frequency bands of one mode each."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -11,7 +11,7 @@ from workbench.gap.prediction.residuals import lead_of
 from workbench.gap.setup.corrections import Correction, SetupFault, without_faults
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
-from workbench.rig.simulate import is_stepped, predict
+from workbench.rig.simulate import is_stepped, simulate_record
 
 LEAST_POWER = 1e-2  # of a channel's power: a band with less holds noise and leakage, and is not compared
 LARGEST_LOG_RATIO = 3.0  # bound of |log amplitude ratio|, so that one band that an effect changes does not dominate
@@ -19,7 +19,7 @@ FADE = 0.25  # of a record: its end is faded out over it; its beginning, from re
 # rms residual, in standard deviations of the channel, from which it may be connected wrongly: a wrong sign leaves 2, an
 # exchange about 1.4, a factor of 2π at least 0.84
 WIDE_GAP = 0.3
-LARGEST_LEFT = 0.15  # share of a channel's measured power that may remain beyond the noise: zero predictions leave all
+LARGEST_LEFT = 0.15  # share of a channel's measured power that may remain beyond the noise: zero simulations leave all
 NOISY = 0.5  # share of noise in a channel's measured power from which it shows no fault
 CLOSED = 0.9  # share of the closable power that a correction must remove, on the channels that it concerns
 AFFECTED = 0.2  # change of the misfit from which a correction affects a band
@@ -41,7 +41,7 @@ class Spectra:
     @staticmethod
     def of_signals(signals: Sequence[Floats], records: Sequence[Record], frequencies_hz: Floats) -> "Spectra":
         """Spectra of signals, (n_signals, n_samples) a record; bands end halfway between two natural frequencies."""
-        # every line is compared in some band; `localisation.where` shares a gap among modes, and takes geometric means
+        # every line is compared in some band; `localisation.breakdown` shares a gap among modes, by geometric means
         edges_hz = np.r_[0.0, (frequencies_hz[1:] + frequencies_hz[:-1]) / 2.0, np.inf]
         lines, edges = [], []
         for signal, record in zip(signals, records, strict=True):
@@ -78,69 +78,69 @@ def compared_bands(measured: Spectra) -> Flags:
     return np.asarray(measured.power > LEAST_POWER * measured.power.sum(axis=2, keepdims=True))
 
 
-def band_misfit(measured: Spectra, predicted: Spectra, factor: float = 1.0) -> Floats:
-    """|log amplitude ratio| + 1 - correlation (n_records, n_signals, n_modes), with the prediction scaled by `factor`.
+def band_misfit(measured: Spectra, simulated: Spectra, factor: float = 1.0) -> Floats:
+    """|log amplitude ratio| + 1 - correlation (n_records, n_signals, n_modes), with the simulation scaled by `factor`.
 
     A missing effect shifts resonances and changes the amplitudes of some bands, up or down; a fault of the set-up
     changes all bands alike.
     """
     tiny = 1e-300
     with np.errstate(over="ignore", invalid="ignore"):
-        of_y, of_p, both = measured.power, predicted.power, measured.cross_power(predicted)
+        of_y, of_p, both = measured.power, simulated.power, measured.cross_power(simulated)
         ratio = 0.5 * (np.log(np.maximum(of_y, tiny)) - np.log(np.maximum(of_p * factor**2, tiny)))
         correlation = np.sign(factor) * both / np.sqrt(np.maximum(of_y * of_p, tiny))
         misfit = np.minimum(np.abs(ratio), LARGEST_LOG_RATIO) + 1.0 - correlation
         return np.asarray(np.nan_to_num(misfit, nan=LARGEST_LOG_RATIO + 1.0))
 
 
-def log_ratios(measured: Spectra, predicted: Spectra) -> Floats:
-    """Log of measured over predicted amplitude (n_records, n_signals, n_modes); NaN in bands that are not compared."""
+def log_ratios(measured: Spectra, simulated: Spectra) -> Floats:
+    """Log of measured over simulated amplitude (n_records, n_signals, n_modes); NaN in bands that are not compared."""
     with np.errstate(over="ignore", invalid="ignore"):
-        of_y, of_p = (np.log(np.maximum(each.power, 1e-300)) for each in (measured, predicted))
+        of_y, of_p = (np.log(np.maximum(each.power, 1e-300)) for each in (measured, simulated))
         ratio = 0.5 * (of_y - of_p)
     return np.where(compared_bands(measured) & np.isfinite(ratio), ratio, np.nan)
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Measured and predicted outputs of records, after the settling time.
+    """Measured and simulated outputs of records, after the transient.
 
     Attributes:
-        rig: that predicts.
+        rig: that is simulated.
         records: that are compared.
-        predicted, measured: (n_outputs, n_samples) of each record.
+        simulated, measured: (n_outputs, n_samples) of each record.
         noise: (n_outputs,) noise power, as a share of the power measured.
         scale: (n_outputs,) mean square measured, in squared units of the output; 1 where it is zero.
-        settle: seconds at the start of each record that are not compared.
+        transient: seconds at the start of each record that are not compared.
         cache: comparisons after corrections.
     """
 
     rig: Rig
     records: Sequence[Record]
-    predicted: Sequence[Floats]
+    simulated: Sequence[Floats]
     measured: list[np.ndarray]
     noise: np.ndarray
     scale: np.ndarray
-    settle: float
+    transient: float
     cache: dict[Correction, "Comparison"] = field(default_factory=dict)
 
     @staticmethod
     def of(
-        rig: Rig, records: Sequence[Record], settle: float, predicted: Sequence[Floats] | None = None
+        rig: Rig, records: Sequence[Record], transient: float, simulated: Sequence[Floats] | None = None
     ) -> "Comparison":
-        """The comparison of a rig with records; predicted: the predictions, if they are known."""
-        measured = [record.outputs[:, lead_of(record, settle) :] for record in records]
-        if predicted is None:
-            predicted = _compared_samples(measured, [predicted_by(rig, record) for record in records])
+        """The comparison of a rig with records; simulated: the simulations, if they are known."""
+        measured = [record.outputs[:, lead_of(record, transient) :] for record in records]
+        if simulated is None:
+            simulated = _compared_samples(measured, [simulated_by(rig, record) for record in records])
         power = sum((y**2).sum(axis=1) for y in measured) / sum(y.shape[1] for y in measured)
         scale = np.where(power > 0, power, 1.0)
         noise = np.array([s.noise_std for s in rig.sensors]) ** 2 / scale
-        return Comparison(rig, records, predicted, measured, noise, scale, settle)
+        return Comparison(rig, records, simulated, measured, noise, scale, transient)
 
     def corrected(self, correction: Correction) -> "Comparison":
         """The corrected rig and the corrected records, compared; cached, since the same one is needed again."""
         if correction not in self.cache:
-            self.cache[correction] = Comparison.of(*correction(self.rig, self.records), self.settle)
+            self.cache[correction] = Comparison.of(*correction(self.rig, self.records), self.transient)
         return self.cache[correction]
 
     def without(self, fault: SetupFault) -> "Comparison":
@@ -149,13 +149,13 @@ class Comparison:
             return self
         if not fault.records or set(self.record_names) <= set(fault.records):
             return self.corrected(fault.correction)
-        return Comparison.of(*without_faults([fault], self.rig, self.records), self.settle)
+        return Comparison.of(*without_faults([fault], self.rig, self.records), self.transient)
 
     @cached_property
     def by_record(self) -> list["Comparison"]:
         """The comparison of each record alone."""
-        pairs = zip(self.records, self.predicted, strict=True)
-        return [Comparison.of(self.rig, (record,), self.settle, (predicted,)) for record, predicted in pairs]
+        pairs = zip(self.records, self.simulated, strict=True)
+        return [Comparison.of(self.rig, (record,), self.transient, (simulated,)) for record, simulated in pairs]
 
     @cached_property
     def by_input(self) -> list[list[Floats]]:
@@ -164,7 +164,7 @@ class Comparison:
         if not 1 < m <= MOST_CHANNELS or is_stepped(self.rig):
             return []
         alone = [[replace(r, inputs=r.inputs * (np.arange(m) == p)[:, None]) for r in self.records] for p in range(m)]
-        return [self.predict(self.rig, records) for records in alone]
+        return [self.simulated_with(self.rig, records) for records in alone]
 
     @property
     def record_names(self) -> tuple[str, ...]:
@@ -174,7 +174,7 @@ class Comparison:
     @cached_property
     def before(self) -> Floats:
         """Residual power (n_outputs,) of the rig without any correction, as a share of the power measured."""
-        return self.residual_power(self.predicted)
+        return self.residual_power(self.simulated)
 
     @property
     def wide(self) -> Flags:
@@ -188,19 +188,19 @@ class Comparison:
         return self.spectra_of(self.measured)
 
     @cached_property
-    def predicted_spectra(self) -> Spectra:
-        """Spectra of the predicted outputs."""
-        return self.spectra_of(self.predicted)
+    def simulated_spectra(self) -> Spectra:
+        """Spectra of the simulated outputs."""
+        return self.spectra_of(self.simulated)
 
     @cached_property
     def misfit(self) -> Floats:
         """Misfit (n_records, n_outputs, n_modes) of each output in each band; see `band_misfit`."""
-        return band_misfit(self.measured_spectra, self.predicted_spectra)
+        return band_misfit(self.measured_spectra, self.simulated_spectra)
 
     @cached_property
     def log_ratios(self) -> Floats:
-        """Log of measured over predicted amplitude (n_records, n_outputs, n_modes); NaN in bands not compared."""
-        return log_ratios(self.measured_spectra, self.predicted_spectra)
+        """Log of measured over simulated amplitude (n_records, n_outputs, n_modes); NaN in bands not compared."""
+        return log_ratios(self.measured_spectra, self.simulated_spectra)
 
     @property
     def n_samples(self) -> int:
@@ -219,19 +219,19 @@ class Comparison:
 
     @cached_property
     def gains(self) -> Floats:
-        """Factors (n_outputs,) by which the predictions fit the measured outputs best, by least squares."""
-        over = sum((p**2).sum(axis=1) for p in self.predicted)
-        along = sum((y * p).sum(axis=1) for y, p in zip(self.measured, self.predicted, strict=True))
+        """Factors (n_outputs,) by which the simulations fit the measured outputs best, by least squares."""
+        over = sum((p**2).sum(axis=1) for p in self.simulated)
+        along = sum((y * p).sum(axis=1) for y, p in zip(self.measured, self.simulated, strict=True))
         return np.asarray(np.divide(along, over, out=np.ones_like(over), where=over > 0))
 
-    def predict(self, rig: Rig, records: Sequence[Record]) -> list[Floats]:
+    def simulated_with(self, rig: Rig, records: Sequence[Record]) -> list[Floats]:
         """Predictions (n_outputs, n_samples) of another rig for other records, at the samples that are compared."""
-        return _compared_samples(self.measured, [predicted_by(rig, record) for record in records])
+        return _compared_samples(self.measured, [simulated_by(rig, record) for record in records])
 
-    def residual_power(self, predicted: Sequence[Floats]) -> Floats:
-        """Mean square residual (n_outputs,) of predictions, as a share of the mean square measured."""
+    def residual_power(self, simulated: Sequence[Floats]) -> Floats:
+        """Mean square residual (n_outputs,) of simulations, as a share of the mean square measured."""
         with np.errstate(over="ignore", invalid="ignore"):
-            left = sum(((y - p) ** 2).sum(axis=1) for y, p in zip(self.measured, predicted, strict=True))
+            left = sum(((y - p) ** 2).sum(axis=1) for y, p in zip(self.measured, simulated, strict=True))
         return np.asarray(np.nan_to_num(left / self.n_samples / self.scale, nan=np.inf))
 
     def closed(self, after: np.ndarray) -> np.ndarray:
@@ -249,16 +249,16 @@ class Comparison:
 
     def closes(self, rig: Rig, records: Sequence[Record]) -> float:
         """The share that a corrected rig and records close: the median over channels with a wide gap."""
-        after = self.residual_power(self.predict(rig, records))
+        after = self.residual_power(self.simulated_with(rig, records))
         return float(np.median(self.closed(after)[self.wide]))
 
 
-def _compared_samples(measured: Sequence[Floats], predicted: Sequence[Floats]) -> list[Floats]:
-    """The last samples of each prediction, as many as are measured after the settling time."""
-    return [p[:, p.shape[1] - y.shape[1] :] for y, p in zip(measured, predicted, strict=True)]
+def _compared_samples(measured: Sequence[Floats], simulated: Sequence[Floats]) -> list[Floats]:
+    """The last samples of each simulation, as many as are measured after the transient."""
+    return [p[:, p.shape[1] - y.shape[1] :] for y, p in zip(measured, simulated, strict=True)]
 
 
-def predicted_by(rig: Rig, record: Record) -> Floats:
-    """Prediction (n_outputs, n_samples) of a rig, as `predict`, without warnings if it diverges."""
+def simulated_by(rig: Rig, record: Record) -> Floats:
+    """Readings (n_outputs, n_samples) of a rig, as `simulate_record`, without warnings if it diverges."""
     with np.errstate(over="ignore", invalid="ignore"):
-        return predict(rig, record)
+        return simulate_record(rig, record)

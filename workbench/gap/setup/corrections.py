@@ -169,7 +169,7 @@ def inputs_times(factors: dict[str, float], rig: Rig, records: Sequence[Record])
 
 def exchanged(side: str, one: str, other: str, rig: Rig, records: Sequence[Record]) -> Corrected:
     """Two channels of the records exchanged; side: "inputs" or "outputs"."""
-    names = [port.name for port in (rig.actuators if side == "inputs" else rig.sensors)]
+    names = [transducer.name for transducer in (rig.actuators if side == "inputs" else rig.sensors)]
     order = list(range(len(names)))
     i, j = names.index(one), names.index(other)
     order[i], order[j] = j, i

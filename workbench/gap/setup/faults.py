@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from workbench.gap.effects.effect import Effect
-from workbench.gap.effects.ports import SWAPPED_INPUTS, SWAPPED_OUTPUTS
+from workbench.gap.effects.transducers import SWAPPED_INPUTS, SWAPPED_OUTPUTS
 from workbench.gap.setup.channels import (
     channel_faults,
     largest_difference,
@@ -39,7 +39,7 @@ DETECTORS: tuple[Detector, ...] = (
 
 
 def setup_faults(
-    rig: Rig, records: Sequence[Record], validation: Sequence[Record] = (), *, settle: float = 0.0
+    rig: Rig, records: Sequence[Record], validation: Sequence[Record] = (), *, transient: float = 0.0
 ) -> tuple[SetupFault, ...]:
     """The faults of the test set-up that the records show, in the order in which they are to be corrected.
 
@@ -50,7 +50,7 @@ def setup_faults(
         rig: nominal.
         records: with the rig's inputs and outputs, in its order.
         validation: likewise, kept out of every fit.
-        settle: seconds at the start of each record that are not compared.
+        transient: seconds at the start of each record that are not compared.
 
     Raises:
         ValueError: two records of one name.
@@ -58,8 +58,8 @@ def setup_faults(
     check_names((*records, *validation))
     found = [*repeated(records), *copied(rig, records)]
     (corrected, fit), (_, held_out) = (without_faults(found, rig, these) for these in (records, validation))
-    together = Comparison.of(corrected, fit, settle)
-    alone = [*together.by_record, *(Comparison.of(corrected, (record,), settle) for record in held_out)]
+    together = Comparison.of(corrected, fit, transient)
+    alone = [*together.by_record, *(Comparison.of(corrected, (record,), transient) for record in held_out)]
     late = late_records(alone)
     if late:
         together, alone = _without_all(together, late), [_without_all(gap, late) for gap in alone]

@@ -9,7 +9,7 @@ from workbench.gap.effects.structural import modes_of
 from workbench.gap.prediction.residuals import lead_of
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
-from workbench.rig.simulate import predict
+from workbench.rig.simulate import simulate_record
 from workbench.structure.domain import NamedPoints
 from workbench.structure.member import Structure
 from workbench.structure.modes import Modes
@@ -41,12 +41,12 @@ class RecordsError(ValueError):
 
 
 def check_records(
-    rig: Rig, records: Sequence[Record], validation: Sequence[Record] = (), *, settle: float = 0.0
+    rig: Rig, records: Sequence[Record], validation: Sequence[Record] = (), *, transient: float = 0.0
 ) -> None:
     """Refuse records, to be fitted or held out, whose channels are not, or cannot be, those of the rig.
 
     Args:
-        settle: seconds at the start of each record that are not compared.
+        transient: seconds at the start of each record that are not compared.
 
     Raises:
         RecordsError: for channels that are not the rig's in its order, a sensor with the wrong sign or in other units,
@@ -55,14 +55,16 @@ def check_records(
     """
     if not rig.actuators:
         raise RecordsError("the rig has no actuators, so nothing drives its model; a free decay is for wb.identify")
-    check_alive(rig, records, validation, settle=settle)
-    levels = _check_signs_and_units(rig, records, "record", settle)
+    check_alive(rig, records, validation, transient=transient)
+    levels = _check_signs_and_units(rig, records, "record", transient)
     if not levels:
         raise RecordsError("every input of every record is at rest; there is nothing to compare")
-    _check_dead(rig, levels | _check_signs_and_units(rig, validation, "validation record", settle))
+    _check_dead(rig, levels | _check_signs_and_units(rig, validation, "validation record", transient))
 
 
-def check_alive(rig: Rig, records: Sequence[Record], validation: Sequence[Record] = (), *, settle: float = 0.0) -> None:
+def check_alive(
+    rig: Rig, records: Sequence[Record], validation: Sequence[Record] = (), *, transient: float = 0.0
+) -> None:
     """Refuse records of other channels or few samples, and channels that are saturated or flat: no model is needed.
 
     Args, Raises: as `check_records`.
@@ -78,14 +80,15 @@ def check_alive(rig: Rig, records: Sequence[Record], validation: Sequence[Record
     _check_not_saturated(rig, records)
     for these, what in ((records, "record"), (validation, "validation record")):
         for record in these:
-            counted = record.n_samples - lead_of(record, settle)
+            counted = record.n_samples - lead_of(record, transient)
             if counted < LEAST_SAMPLES:
                 raise RecordsError(
-                    f"{what} {record.name!r} has {counted} samples to compare{' once settled' * (settle > 0)}; at least"
-                    f" {LEAST_SAMPLES} are needed: take a longer record{' or a smaller settle' * (settle > 0)}"
+                    f"{what} {record.name!r} has {counted} samples to compare{' after transients' * (transient > 0)};"
+                    f" at least {LEAST_SAMPLES} are needed: take a longer record"
+                    f"{' or a shorter transient' * (transient > 0)}"
                 )
         for record in filter(_is_driven, these):
-            for sensor, measured in zip(rig.sensors, record.outputs[:, lead_of(record, settle) :], strict=True):
+            for sensor, measured in zip(rig.sensors, record.outputs[:, lead_of(record, transient) :], strict=True):
                 if np.ptp(measured) == 0:
                     raise RecordsError(
                         f"{what} {record.name!r}: output {sensor.name!r} is flat; check the sensor and its cable, or"
@@ -120,7 +123,7 @@ def _check_dead(rig: Rig, levels: Levels) -> None:
             )
 
 
-def _check_signs_and_units(rig: Rig, records: Sequence[Record], what: str, settle: float) -> Levels:
+def _check_signs_and_units(rig: Rig, records: Sequence[Record], what: str, transient: float) -> Levels:
     """Refuse records that are too short or disagree in sign or unit with the model; return the levels of driven ones.
 
     Args:
@@ -130,7 +133,7 @@ def _check_signs_and_units(rig: Rig, records: Sequence[Record], what: str, settl
     levels: Levels = {}
     correlations, ratios = [], []
     for record in records:
-        lead = lead_of(record, settle)
+        lead = lead_of(record, transient)
         if elastic.size and record.n_samples * record.sample_time < 2 * np.pi / elastic[0]:
             raise RecordsError(
                 f"{what} {record.name!r} lasts {record.n_samples * record.sample_time:g} s, less than a period of the"
@@ -138,7 +141,7 @@ def _check_signs_and_units(rig: Rig, records: Sequence[Record], what: str, settl
             )
         if not _is_driven(record):
             continue
-        predicted = predict(rig, record)[:, lead:]
+        predicted = simulate_record(rig, record)[:, lead:]
         outputs = record.outputs[:, lead:]
         pairs = zip(outputs, predicted, strict=True)
         row = [float(np.corrcoef(y, p)[0, 1]) if np.ptp(p) > 0 else 0.0 for y, p in pairs]

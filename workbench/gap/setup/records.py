@@ -7,12 +7,12 @@ from itertools import combinations
 import numpy as np
 
 from workbench.arrays import Floats
-from workbench.gap.setup.comparison import predicted_by
+from workbench.gap.setup.comparison import simulated_by
 from workbench.gap.setup.corrections import SetupFault, without_output, without_record
 from workbench.identification.signal import data_quality
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
-from workbench.rig.simulate import predict
+from workbench.rig.simulate import simulate_record
 from workbench.structure.printed import joined_in_words
 
 # a first reading farther than each of these from zero, from the mean and from the prediction shows motion
@@ -86,7 +86,7 @@ def copied(rig: Rig, records: Sequence[Record]) -> list[SetupFault]:
             continue
         errors = [np.zeros(2)]
         for record in records:
-            predicted = predicted_by(rig, record)
+            predicted = simulated_by(rig, record)
             errors.append(np.array([((record.outputs[k] - predicted[k]) ** 2).mean() for k in (i, j)]))
         error_i, error_j = np.sum(errors, axis=0)
         copy = j if error_i <= error_j else i
@@ -104,17 +104,17 @@ def copied(rig: Rig, records: Sequence[Record]) -> list[SetupFault]:
     return faults
 
 
-def data_faults(rig: Rig, records: Sequence[Record], *, settle: float = 0.0) -> tuple[str, ...]:
+def data_faults(rig: Rig, records: Sequence[Record], *, transient: float = 0.0) -> tuple[str, ...]:
     """One sentence for each record that starts in motion or is clipped and each stuck channel, with the correction.
 
     Args:
         rig: nominal.
         records: with the rig's inputs and outputs, in its order.
-        settle: seconds at the start of each record that are not compared.
+        transient: seconds at the start of each record that are not compared.
     """
     found = []
     for record in records:
-        found += [] if settle else _in_motion(rig, record)
+        found += [] if transient else _in_motion(rig, record)
         found += _stuck(record)
         found += _clipped(record)
     return tuple(found)
@@ -126,7 +126,7 @@ def _in_motion(rig: Rig, record: Record) -> list[str]:
     A bias and a constant load leave the first reading at the mean. An acceleration jumps with the first force: the rig
     predicts that jump up to errors of gains and masses, and a late sensor reads zero instead.
     """
-    from_rest = predict(rig, record)[:, 0]
+    from_rest = simulate_record(rig, record)[:, 0]
     for sensor, y, jump in zip(rig.sensors, record.outputs, from_rest, strict=True):
         first = float(y[0])
         off = min(abs(first), abs(first - float(y.mean())), abs(first - float(jump)))
@@ -136,7 +136,7 @@ def _in_motion(rig: Rig, record: Record) -> list[str]:
         if off > least:
             return [
                 f"Record {record.name!r} does not start from rest ({sensor.name} reads {first:.3g}, where at rest it"
-                f" would read {jump:.3g}): cut it where nothing moves, or set `settle` to a few decay times of the"
+                f" would read {jump:.3g}): cut it where nothing moves, or set `transient` to a few decay times of the"
                 " slowest mode, which are then not compared."
             ]
     return []

@@ -48,7 +48,7 @@ def sampling_rates(gap: Comparison) -> list[SetupFault]:
         shares = {
             factor: own.closes(rig, [other])
             for factor, other in corrected.items()
-            if 2 * lead_of(other, gap.settle) < other.n_samples  # otherwise few samples would be left to compare
+            if 2 * lead_of(other, gap.transient) < other.n_samples  # otherwise few samples would be left to compare
         }
         best = max(shares, key=lambda factor: shares[factor], default=None)
         if best is not None and shares[best] >= CLOSED:
@@ -147,7 +147,7 @@ def _delay_of(gap: Comparison) -> float | None:
     """
     if np.count_nonzero(compared_bands(gap.measured_spectra).any(axis=(0, 1))) < LEAST_MODES:
         return None
-    (measured,), (predicted,) = gap.measured_spectra.lines, gap.predicted_spectra.lines
+    (measured,), (predicted,) = gap.measured_spectra.lines, gap.simulated_spectra.lines
     cross = np.sum(measured * predicted.conj() / gap.scale[:, None], axis=0)
     if not np.isfinite(cross).all():
         return None

@@ -14,10 +14,10 @@ from scipy.stats import chi2
 
 from workbench.identification.free_decay.refinement import in_coloured_noise, refine
 from workbench.identification.signal.data_quality import dropouts, steps
-from workbench.identification.signal.modal_estimates import Refined
+from workbench.identification.signal.modal_estimates import RefinedModes
 from workbench.identification.signal.searches import TimeLimit
 from workbench.records.record import Record, as_records
-from workbench.renamed import Renamed
+from workbench.renamed import Renamed, former_arguments
 from workbench.structure.damping import ProportionalDamping
 from workbench.structure.modes import frozen
 from workbench.threads import one_blas_thread
@@ -85,12 +85,13 @@ class AmplitudeDependence:
         return "; ".join(f"{f:.5g} Hz, {100 * zeta:.3g} % at amplitude {size:.3g}" for f, zeta, size in each)
 
 
+@former_arguments(stretches="segments")
 @one_blas_thread
 def amplitude_dependence(
     records: Record | Sequence[Record],
-    refined: Refined,
+    refined: RefinedModes,
     *,
-    stretches: int = ASSUMPTIONS.segments,
+    segments: int = ASSUMPTIONS.segments,
     time_limit: TimeLimit | None = None,
 ) -> AmplitudeDependence:
     """Frequency and damping of each mode of free decays by amplitude, in segments of the records.
@@ -98,18 +99,18 @@ def amplitude_dependence(
     Args:
         records: the free decays that `refined` was identified from.
         refined: their modes.
-        stretches: number of segments of each record, each twice as long as the one before.
+        segments: number of segments of each record, each twice as long as the one before.
         time_limit: of processor time, after which no further segment is analysed; none unless given.
 
     Raises:
         ValueError: fewer than two segments.
     """
-    if stretches < 2:
-        raise ValueError(f"amplitudes are compared over two stretches or more; got {stretches}")
+    if segments < 2:
+        raise ValueError(f"amplitudes are compared over two segments or more; got {segments}")
     records = as_records(records)
     each = zip(records, refined.amplitudes, refined.noise, strict=True)
     time_limit = TimeLimit() if time_limit is None else time_limit
-    values = [_segments(record, refined, np.abs(a), noise, stretches, time_limit) for record, a, noise in each]
+    values = [_segments(record, refined, np.abs(a), noise, segments, time_limit) for record, a, noise in each]
     start = np.concatenate([each[0] for each in values])
     amplitude, omega, omega_std, zeta, zeta_std = (frozen(rows) for rows in np.hstack([each[1] for each in values]))
     probability = np.stack(
@@ -118,22 +119,22 @@ def amplitude_dependence(
             _equality(zeta, np.hypot(zeta_std, ASSUMPTIONS.resolution[1] * zeta)),
         ]
     )
-    which = np.repeat(np.arange(len(records)), stretches)
+    which = np.repeat(np.arange(len(records)), segments)
     return AmplitudeDependence(
         frozen(which, int), frozen(start), amplitude, omega, omega_std, zeta, zeta_std, frozen(probability)
     )
 
 
 def _segments(
-    record: Record, refined: Refined, size: np.ndarray, noise: np.ndarray, stretches: int, time_limit: TimeLimit
+    record: Record, refined: RefinedModes, size: np.ndarray, noise: np.ndarray, segments: int, time_limit: TimeLimit
 ) -> tuple[np.ndarray, np.ndarray]:
     """Starts of the segments of a record, (n_segments,) s, and the modes in each, (5, n_segments, n_modes).
 
     These are amplitude, ω and its standard error, ζ and its standard error.
     """
     modes = refined.modes
-    edges = np.round((2.0 ** np.arange(stretches + 1) - 1) / (2.0**stretches - 1) * record.n_samples).astype(int)
-    values_by_stretch = np.full((5, stretches, modes.n_modes), np.nan)
+    edges = np.round((2.0 ** np.arange(segments + 1) - 1) / (2.0**segments - 1) * record.n_samples).astype(int)
+    values_by_segment = np.full((5, segments, modes.n_modes), np.nan)
     spacing = np.abs(np.subtract.outer(modes.omega, modes.omega))
     dropped = [(at, at + (count - 1) * record.sample_time) for _, at, count, _ in dropouts(record)]
     least_rms = ASSUMPTIONS.rounded * steps(record)
@@ -174,9 +175,9 @@ def _segments(
         # Two modes whose beat is longer than the segment look like one that changes.
         sure &= beats[significant] * span > 2.0 * np.pi
         values = (refitted.modes.omega, refitted.omega_std, refitted.modes.zeta, refitted.zeta_std)
-        values_by_stretch[0, w, significant[sure]] = np.sqrt(mean_square[:, significant[sure]].max(axis=0))
-        values_by_stretch[1:, w, significant[sure]] = np.stack(values)[:, sure]
-    return record.start_time + record.sample_time * edges[:-1], values_by_stretch
+        values_by_segment[0, w, significant[sure]] = np.sqrt(mean_square[:, significant[sure]].max(axis=0))
+        values_by_segment[1:, w, significant[sure]] = np.stack(values)[:, sure]
+    return record.start_time + record.sample_time * edges[:-1], values_by_segment
 
 
 def _equality(values: np.ndarray, std: np.ndarray) -> np.ndarray:
@@ -212,7 +213,7 @@ class ProportionalFit:
     left_over = Renamed("standardised_residuals")
 
 
-def proportional_fit(refined: Refined, only: Sequence[int] | slice = slice(None)) -> ProportionalFit:
+def proportional_fit(refined: RefinedModes, only: Sequence[int] | slice = slice(None)) -> ProportionalFit:
     """Weighted least squares of ζ_r = (β ω_r + α / ω_r) / 2 (3.32), weights from the covariance of ζ.
 
     Args:

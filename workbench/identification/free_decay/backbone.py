@@ -26,7 +26,7 @@ from scipy.fft import fft, rfft
 
 from workbench.arrays import Complexes, Floats
 from workbench.identification.signal.projection import project
-from workbench.identification.signal.searches import FIT, Once
+from workbench.identification.signal.searches import FIT, CachedResidual
 from workbench.records.record import Record
 
 
@@ -181,7 +181,7 @@ def while_it_lasts(record: Record, pair: np.ndarray, n_modes: int) -> Record:
     return record.between(record.start_time, record.start_time + int(last) * record.sample_time)
 
 
-def _least_squares(once: Once, start: Floats, most_tries: int = BACKBONE.most_tries) -> Floats:
+def _least_squares(once: CachedResidual, start: Floats, most_tries: int = BACKBONE.most_tries) -> Floats:
     return once.least(start, most_tries, ftol=BACKBONE.settled)
 
 
@@ -210,7 +210,7 @@ def _modes_misfit(bands: Sequence[_Band], poles: Complexes) -> Floats:
     start = np.r_[poles.real, poles.imag]
     if len(bands) > 1:
         weights = np.sqrt([band.size for band in bands] / (squares(start) + [band.round_off for band in bands]))
-    return squares(_least_squares(Once(weighted), start))
+    return squares(_least_squares(CachedResidual(weighted), start))
 
 
 def backbone_misfit(band: _Band, pair: Complexes, *, enough: float = 0.0) -> float:
@@ -309,7 +309,7 @@ class _Backbone:
 
     def __init__(self, band: _Band, powers: np.ndarray) -> None:
         self.band, self.time, self.powers = band, band.time, powers
-        self.once = Once(self.fitted)
+        self.once = CachedResidual(self.fitted)
 
     def starts(self, pair: np.ndarray) -> Iterator[Floats]:
         """Starts of the fit: the backbone of the sum z of two linear modes, z'/z by |z|; the stronger mode alone."""
@@ -345,7 +345,7 @@ class _Common:
 
     def __init__(self, each: Sequence[_Backbone], weights: Floats) -> None:
         self.each, self.weights, self.powers = each, weights, each[0].powers
-        self.once = Once(self.fitted)
+        self.once = CachedResidual(self.fitted)
 
     def start(self, pair: np.ndarray) -> Floats:
         """The start of the fit: the common backbone of the sums of two linear modes in all records."""

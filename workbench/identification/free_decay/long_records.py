@@ -32,7 +32,7 @@ from workbench.identification.free_decay.refinement import (
     over_noise,
     thresholds,
 )
-from workbench.identification.signal.modal_estimates import Identified
+from workbench.identification.signal.modal_estimates import IdentifiedModes
 from workbench.identification.signal.projection import forget_transforms, independent, project
 from workbench.identification.signal.searches import FALSE_ALARM, FIT, FURTHER, SELECTION, TimeLimit, spurious_modes
 from workbench.records.record import Record
@@ -67,7 +67,7 @@ LONG = LongSettings()
 
 def identify_long(
     records: Sequence[Record], *, max_modes: int, false_alarm: float = FALSE_ALARM, time_limit: TimeLimit | None = None
-) -> Identified | None:
+) -> IdentifiedModes | None:
     """The modes of long records, their number selected; None where none is significant.
 
     Args:
@@ -208,7 +208,7 @@ class _Search:
         shapes = np.hstack(np.split(over_noise(self.fits, self.weights)[:, which], len(self.fits)))
         return np.linalg.qr(np.hstack([shapes.real, shapes.imag]))[0]
 
-    def refined(self, statistic: np.ndarray) -> Identified:
+    def refined(self, statistic: np.ndarray) -> IdentifiedModes:
         """The modes with their covariance, and the statistic (n_modes,) of each."""
         fit = self.records, self.poles, self.fits, self.noise
         refined = as_refined(*fit, converged=self.converged, steps=self.steps)

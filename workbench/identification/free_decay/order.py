@@ -35,7 +35,7 @@ from workbench.identification.free_decay.refinement import (
     unshaped,
 )
 from workbench.identification.signal.data_quality import check_data_quality, of_same_sensors, steps
-from workbench.identification.signal.modal_estimates import Identified
+from workbench.identification.signal.modal_estimates import IdentifiedModes
 from workbench.identification.signal.projection import (
     Projection,
     differ,
@@ -102,7 +102,7 @@ def identify(
     false_alarm: float = FALSE_ALARM,
     seconds: float | None = SECONDS,
     progress: Progress | None = None,
-) -> Identified:
+) -> IdentifiedModes:
     """The modes of a free decay, their number selected, each with its standard error.
 
     In records of more than 100,000 values in all many modes enter at a time (`long_records`).
@@ -162,7 +162,7 @@ def _starts_later(record: Record) -> tuple[str, ...]:
 
 def identify_within(
     records: Sequence[Record], time_limit: TimeLimit, *, max_modes: int | None = None, false_alarm: float = FALSE_ALARM
-) -> Identified:
+) -> IdentifiedModes:
     """`identify` within the time left of `time_limit`, artefacts included."""
     for record in records:
         check_data_quality(record)
@@ -184,7 +184,7 @@ def identify_within(
 
 def _identify_stepwise(
     records: Sequence[Record], *, max_modes: int, false_alarm: float, time_limit: TimeLimit
-) -> Identified | None:
+) -> IdentifiedModes | None:
     """The modes by stepwise selection, in the records as measured and then whitened; None where none is significant."""
     search_time = time_limit.share(SELECTION.search_share)
     verdicts: Verdicts = []
@@ -406,7 +406,7 @@ class _FreeDecay:
         span = max(record.n_samples * record.sample_time for record in self.records)
         return poles[(poles.real * span < SELECTION.most_growth) & (np.abs(poles) * span > 2.0 * np.pi)]
 
-    def refined(self, model: _Model) -> Identified:
+    def refined(self, model: _Model) -> IdentifiedModes:
         """The modes refined in the records as measured: whitening filters lose the first samples, the strongest."""
         poles, records = model.poles, self.measured
         if self.time_limit.unfinished:  # perhaps before all modes were tested

@@ -19,8 +19,8 @@ from scipy.stats import chi2
 from workbench.arrays import scaled_inverse, symmetric_root
 from workbench.identification.signal.data_quality import of_same_sensors
 from workbench.identification.signal.modal_estimates import (
-    Identified,
-    Refined,
+    IdentifiedModes,
+    RefinedModes,
     by_poles,
     normalised_shapes,
     time_derivatives,
@@ -47,13 +47,13 @@ def unshaped(poles: np.ndarray, record: Record) -> SampledModes:
 
 
 def identified(
-    refined: Refined,
+    refined: RefinedModes,
     statistic: np.ndarray,
     limit: float,
     rejected: Sequence[tuple[complex, float]],
     record: Record,
     remarks: tuple[str, ...],
-) -> Identified:
+) -> IdentifiedModes:
     """The result of an identification: refined modes with their test statistics, and the poles rejected as noise.
 
     Args:
@@ -66,7 +66,9 @@ def identified(
     """
     noise = sorted(rejected, key=lambda pair: abs(pair[0]))
     modes = unshaped(np.array([pole for pole, _ in noise], complex), record)
-    return Identified(refined, frozen(statistic), limit, modes, frozen([strength for _, strength in noise]), remarks)
+    return IdentifiedModes(
+        refined, frozen(statistic), limit, modes, frozen([strength for _, strength in noise]), remarks
+    )
 
 
 def thresholds(false_alarm: float, n_cells: int, n_signals: int) -> tuple[float, float]:
@@ -97,8 +99,8 @@ def amplitude_statistic(
 
 
 def in_coloured_noise(
-    refined: Refined, records: Record | Sequence[Record], fits: Sequence[Projection] | None = None
-) -> Refined:
+    refined: RefinedModes, records: Record | Sequence[Record], fits: Sequence[Projection] | None = None
+) -> RefinedModes:
     """The modes with standard errors that hold in noise of any smooth spectrum.
 
     Noise disturbs a mode within the band of the mode only. Where output j has noise of spectrum S_j, a least squares
@@ -140,7 +142,7 @@ def as_refined(
     steps: int,
     noise_ratio: np.ndarray | None = None,
     shared: np.ndarray | float = 1.0,
-) -> Refined:
+) -> RefinedModes:
     """The modes of a fit with their covariance.
 
     Args:
@@ -165,7 +167,7 @@ def as_refined(
     variance = noise[:, :, None] ** 2 * np.ones(n) * (1.0 if noise_ratio is None else noise_ratio)
     derivative = time_derivatives(records[0].output_channels)
     shapes, shape_factor, shape_variance = _mean_shapes(fits, derivative, covariance, variance)
-    return Refined(
+    return RefinedModes(
         modes=SampledModes.of_poles(poles[order], normalised_shapes(shapes)[:, order], records[0].positions),
         covariance=frozen((jacobian @ covariance @ jacobian.T)[np.ix_(both, both)]),
         amplitudes=tuple(frozen(fit.complex_amplitudes[:, order], complex) for fit in fits),
@@ -278,7 +280,7 @@ def refine(
     *,
     offset: bool = False,
     time_limit: TimeLimit | None = None,
-) -> Refined:
+) -> RefinedModes:
     """The maximum likelihood modes near `start`, with the Cramér-Rao covariance of frequencies, damping and shapes.
 
     Sensors are weighted by their estimated noise in each record. Records share poles, not amplitudes.
@@ -290,7 +292,7 @@ def refine(
         time_limit: of processor time; none unless given.
 
     Returns:
-        `Refined`; check `converged`: a start with modes that the record does not hold may not converge.
+        `RefinedModes`; check `converged`: a start with modes that the record does not hold may not converge.
 
     Raises:
         ValueError: fewer samples than unknowns; no modes to start from.
@@ -315,7 +317,7 @@ def refine(
     return as_refined(records, poles, fit, noise, converged=converged, steps=steps)
 
 
-def cramer_rao_bound(modes: SampledModes, record: Record, *, noise_std: float | Sequence[float]) -> Refined:
+def cramer_rao_bound(modes: SampledModes, record: Record, *, noise_std: float | Sequence[float]) -> RefinedModes:
     """The Cramér-Rao bound of the modes of a free decay: the least covariance of any unbiased estimate.
 
     Args:
@@ -324,7 +326,7 @@ def cramer_rao_bound(modes: SampledModes, record: Record, *, noise_std: float | 
         noise_std: of the white noise of all outputs, or of each (n_outputs,), in their units.
 
     Returns:
-        `Refined` with the true modes and the standard errors of an efficient estimate.
+        `RefinedModes` with the true modes and the standard errors of an efficient estimate.
 
     Raises:
         ValueError: noise that is not positive, or of another number of outputs.

@@ -15,7 +15,7 @@ from workbench.identification.free_decay.assumptions import AmplitudeDependence,
 from workbench.identification.free_decay.order import identify_within
 from workbench.identification.input_output.time_variance import IS_MEAN
 from workbench.identification.signal.harmonics import overtone_remarks
-from workbench.identification.signal.modal_estimates import Refined
+from workbench.identification.signal.modal_estimates import RefinedModes
 from workbench.identification.signal.searches import TimeLimit
 from workbench.records.record import Record
 
@@ -108,7 +108,7 @@ def _free_decay(record: Record) -> Record | None:
     return replace(decay, inputs=decay.inputs[:0], input_channels=())
 
 
-def _significant(refined: Refined, by_amplitude: AmplitudeDependence) -> AfterImpacts:
+def _significant(refined: RefinedModes, by_amplitude: AmplitudeDependence) -> AfterImpacts:
     """The amplitude-dependent modes whose frequency varies by a significant part of the bandwidth."""
     poles, changing, scatter = refined.modes.poles, [], []
     for r in np.flatnonzero(by_amplitude.depends).tolist():

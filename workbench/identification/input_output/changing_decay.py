@@ -31,7 +31,7 @@ from workbench.identification.input_output.rivals import (
     projected_residual,
 )
 from workbench.identification.input_output.spectral_lines import Lines, rows_of_pair
-from workbench.identification.signal.searches import Once, TimeLimit
+from workbench.identification.signal.searches import CachedResidual, TimeLimit
 from workbench.structure.modes import mac
 
 
@@ -209,7 +209,7 @@ class _Peak:
         self.values = self._beyond_others(lines.values.T)
 
     def fitted(self, law: Law, starts: list[np.ndarray]) -> _Fitted | None:
-        once, best, smallest = Once(lambda x: self._residual(self._motions(law, x))), None, np.inf
+        once, best, smallest = CachedResidual(lambda x: self._residual(self._motions(law, x))), None, np.inf
         for start in starts:
             unknowns = np.r_[start.real, start.imag]
             if not once(unknowns)[1].any():

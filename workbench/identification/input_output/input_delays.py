@@ -23,7 +23,7 @@ from workbench.identification.input_output.excitation import n_moving
 from workbench.identification.input_output.fit_errors import fixed_std, statistic_of_each
 from workbench.identification.input_output.known_inputs import KnownInputs, sources
 from workbench.identification.input_output.modal_fit import Fit, projected, settled
-from workbench.identification.input_output.model_order import ORDER, Selected, SelectionOptions
+from workbench.identification.input_output.model_order import ORDER, SelectedModes, SelectionOptions
 from workbench.identification.input_output.selection import select, select_strongest, subspace_start
 from workbench.identification.signal.modal_estimates import time_derivatives
 from workbench.identification.signal.searches import FALSE_ALARM, SELECTION, TimeLimit
@@ -50,8 +50,8 @@ FRACTIONS = np.linspace(0.0, 1.0, 401)  # of a sample
 
 
 def select_with_delays(
-    data: KnownInputs, options: SelectionOptions, strongest: Selected | None
-) -> tuple[KnownInputs, Selected]:
+    data: KnownInputs, options: SelectionOptions, strongest: SelectedModes | None
+) -> tuple[KnownInputs, SelectedModes]:
     """The data with estimated input delays, and the modes.
 
     A delay by a fraction of a sample is estimated where the first response to an input is later than without delay, or
@@ -61,7 +61,7 @@ def select_with_delays(
     if data.hold == "band-limited":
         return _select_with_band_limited_delays(data, first, options, strongest)
     whole = np.maximum(first - (0 if data.hold == "first" else 1), 0)
-    without_delay: tuple[KnownInputs, Selected] | None = None
+    without_delay: tuple[KnownInputs, SelectedModes] | None = None
     if data.hold == "zero" and not first.any():
         return select(data, options, strongest)
     delayed = data.delayed_by(whole, any_fraction=True)
@@ -91,8 +91,8 @@ def select_with_delays(
 
 
 def _select_with_band_limited_delays(
-    data: KnownInputs, first: Floats, options: SelectionOptions, strongest: Selected | None
-) -> tuple[KnownInputs, Selected]:
+    data: KnownInputs, first: Floats, options: SelectionOptions, strongest: SelectedModes | None
+) -> tuple[KnownInputs, SelectedModes]:
     """The data with estimated delays of band-limited inputs, and the modes.
 
     The fraction of a sample is a parameter of its own here: no pair of fixed columns can represent it.

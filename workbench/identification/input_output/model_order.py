@@ -73,7 +73,7 @@ Scored = tuple[float, np.ndarray, complex]  # gain, participation factors and po
 
 
 @dataclass(frozen=True, eq=False)
-class Selected:
+class SelectedModes:
     """The selected modes.
 
     Attributes:
@@ -90,14 +90,14 @@ class Selected:
     full: bool
     distorted: tuple[complex, ...] = ()
 
-    def refitted(self, fit: Fit) -> "Selected":
+    def refitted(self, fit: Fit) -> "SelectedModes":
         """The same selection with another fit, and the statistic of each mode in that fit."""
         return self if fit is self.fit else replace(self, fit=fit, statistic=statistic_of_each(fit))
 
 
 def select_modes(
     data: Measurement, options: SelectionOptions, start: Fit | None = None, *, is_tested: bool = False
-) -> Selected:
+) -> SelectedModes:
     """The modes whose likelihood ratio exceeds the threshold for noise, by forward and backward stepwise selection.
 
     Args:
@@ -120,7 +120,7 @@ def select_modes(
     order = np.argsort(np.abs(fit.poles))
     sorted_already = (np.diff(order) == 1).all()
     ordered = fit if sorted_already else replace(only(data, fit, order), converged=fit.converged, steps=fit.steps)
-    return Selected(ordered, statistic_of_each(fit)[order], problem.limit, selection.full)
+    return SelectedModes(ordered, statistic_of_each(fit)[order], problem.limit, selection.full)
 
 
 def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float) -> Fit:

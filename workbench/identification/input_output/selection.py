@@ -10,7 +10,7 @@ from workbench.identification.input_output.input_noise import input_noise, with_
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, only, projected, settled
 from workbench.identification.input_output.model_order import (
-    Selected,
+    SelectedModes,
     SelectionOptions,
     fit_of_poles,
     is_about_distorted,
@@ -38,8 +38,8 @@ DRIVEN_SELECTION = DrivenSelectionSettings()
 
 
 def select(
-    data: KnownInputs, options: SelectionOptions, strongest: Selected | None = None
-) -> tuple[KnownInputs, Selected]:
+    data: KnownInputs, options: SelectionOptions, strongest: SelectedModes | None = None
+) -> tuple[KnownInputs, SelectedModes]:
     """The modes, estimated with the strongest first; where noise of the outputs is correlated, in combinations without.
 
     Returns:
@@ -78,7 +78,9 @@ def select(
     return reweighted(data, selected, fit, time_limit)
 
 
-def reweighted(data: KnownInputs, selected: Selected, fit: Fit, time_limit: TimeLimit) -> tuple[KnownInputs, Selected]:
+def reweighted(
+    data: KnownInputs, selected: SelectedModes, fit: Fit, time_limit: TimeLimit
+) -> tuple[KnownInputs, SelectedModes]:
     """The data weighted by the noise spectrum of a fit, and the modes refitted to them, by rising frequency."""
     data = replace(data, line_std=data.noise_spectrum(fit))
     return data, selected.refitted(settled(data, only(data, fit, np.argsort(np.abs(fit.poles))), time_limit=time_limit))
@@ -94,7 +96,7 @@ def subspace_start(data: KnownInputs, options: SelectionOptions) -> Fit:
     return only(data, fit, np.argsort(statistic_of_each(fit))[-options.max_modes :])
 
 
-def select_strongest(data: KnownInputs, options: SelectionOptions, start: Fit | None = None) -> Selected:
+def select_strongest(data: KnownInputs, options: SelectionOptions, start: Fit | None = None) -> SelectedModes:
     """The modes of `start`, or else of a subspace model, and further ones up to `DRIVEN_SELECTION.strongest`.
 
     As long as all are sure, as many more are searched: strong modes left out would be taken for noise.
@@ -118,7 +120,7 @@ def _few_of(options: SelectionOptions, fewest: int) -> SelectionOptions:
     return replace(options, max_modes=min(max(DRIVEN_SELECTION.strongest, fewest), options.max_modes))
 
 
-def only_predictive(data: KnownInputs, selected: Selected, time_limit: TimeLimit) -> Selected:
+def only_predictive(data: KnownInputs, selected: SelectedModes, time_limit: TimeLimit) -> SelectedModes:
     """The selected modes without those that make the prediction of held-out data worse.
 
     These are marked as distorted: no further mode is searched near them.
@@ -127,7 +129,9 @@ def only_predictive(data: KnownInputs, selected: Selected, time_limit: TimeLimit
     return replace(selected.refitted(fit), distorted=(*data.distorted, *distorted))
 
 
-def _select_weighted(data: KnownInputs, strongest: Selected, options: SelectionOptions) -> tuple[KnownInputs, Selected]:
+def _select_weighted(
+    data: KnownInputs, strongest: SelectedModes, options: SelectionOptions
+) -> tuple[KnownInputs, SelectedModes]:
     """The modes of outputs of uncorrelated noise, weighted by the spectrum of the residual.
 
     Coloured noise may be taken for modes. A false mode fits noise at its lines, so that the noise there is
@@ -150,15 +154,15 @@ def _select_weighted(data: KnownInputs, strongest: Selected, options: SelectionO
     return (other, fewer) if less_oscillatory or as_likely else (data, selected)
 
 
-def _are_oscillatory(data: KnownInputs, selected: Selected) -> np.ndarray:
+def _are_oscillatory(data: KnownInputs, selected: SelectedModes) -> np.ndarray:
     """Whether each mode oscillates within a record and does not grow, (n_modes,); others may be coloured noise."""
     poles, span = selected.fit.poles, 2.0 * np.pi / data.resolution
     return np.asarray((np.abs(poles) > data.resolution) & (poles.real * span < SELECTION.most_growth))
 
 
 def _alternate_with_noise(
-    data: KnownInputs, selected: Selected, first_options: SelectionOptions, options: SelectionOptions
-) -> tuple[KnownInputs, Selected]:
+    data: KnownInputs, selected: SelectedModes, first_options: SelectionOptions, options: SelectionOptions
+) -> tuple[KnownInputs, SelectedModes]:
     """Modes and noise spectrum, estimated alternately until both settle.
 
     Args:
@@ -185,8 +189,8 @@ def _alternate_with_noise(
 
 
 def _with_changing(
-    data: KnownInputs, selected: Selected, options: SelectionOptions, linear: list[np.ndarray]
-) -> tuple[KnownInputs, Selected]:
+    data: KnownInputs, selected: SelectedModes, options: SelectionOptions, linear: list[np.ndarray]
+) -> tuple[KnownInputs, SelectedModes]:
     """The data with the columns of changing modes, and the modes, as long as these are likelier than close modes.
 
     Args:

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from workbench.arrays import Floats
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit
-from workbench.identification.input_output.model_order import Selected, SelectionOptions
+from workbench.identification.input_output.model_order import SelectedModes, SelectionOptions
 from workbench.identification.input_output.selection import select_strongest
 from workbench.identification.signal.searches import FALSE_ALARM
 from workbench.records.record import Record
@@ -41,7 +41,9 @@ def _may_drift(records: Sequence[Record]) -> bool:
     return False
 
 
-def beside_drift(data: KnownInputs, options: SelectionOptions) -> tuple[KnownInputs, Selected | None, tuple[str, ...]]:
+def beside_drift(
+    data: KnownInputs, options: SelectionOptions
+) -> tuple[KnownInputs, SelectedModes | None, tuple[str, ...]]:
     """The records with polynomials of time where these are likelier, the strongest modes if searched, and a remark.
 
     A displaced free body drifts too: its rigid body mode explains that by the inputs, and stays.
@@ -63,7 +65,7 @@ def beside_drift(data: KnownInputs, options: SelectionOptions) -> tuple[KnownInp
     return drifting, None if ended else beside, (remark,)
 
 
-def _strongest(data: KnownInputs, options: SelectionOptions) -> tuple[Selected, bool]:
+def _strongest(data: KnownInputs, options: SelectionOptions) -> tuple[SelectedModes, bool]:
     """The strongest modes, and whether the time for their search was up."""
     time_limit = options.time_limit.aside(DRIFT.share)
     return select_strongest(data, replace(options, time_limit=time_limit)), bool(time_limit.unfinished)

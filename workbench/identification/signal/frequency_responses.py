@@ -8,8 +8,8 @@ from scipy.fft import rfft
 from scipy.signal import get_window
 
 from workbench.arrays import Flags, Floats
+from workbench.records.frequency_responses import FrequencyResponses
 from workbench.records.record import Record
-from workbench.records.transfer_functions import TransferFunctions
 from workbench.structure.printed import joined_in_words
 
 
@@ -31,11 +31,11 @@ SPECTRA = SpectraSettings()
 
 
 @dataclass(frozen=True, eq=False)
-class FrequencyResponses:
+class FrfEstimate:
     """H1 of several inputs with its coherence.
 
     Attributes:
-        transfer: NaN where an input is silent, or not to be told from the others, and where the inputs are weak and no
+        frf: NaN where an input is silent, or not to be told from the others, and where the inputs are weak and no
             output is coherent with them.
         coherence: (n_outputs, n_lines) multiple coherence of each output with all inputs, in [0, 1], NaN as above.
         averages: number of segments, which overlap by half.
@@ -43,14 +43,14 @@ class FrequencyResponses:
         silent: names of inputs that are constant throughout, and left out.
     """
 
-    transfer: TransferFunctions
+    frf: FrequencyResponses
     coherence: Floats
     averages: int
     units: tuple[str, ...]
     silent: tuple[str, ...]
 
 
-def frequency_responses(records: Sequence[Record]) -> FrequencyResponses:
+def frequency_responses(records: Sequence[Record]) -> FrfEstimate:
     """H = S_yu S_uu⁻¹ of all inputs at once, by spectra averaged over Hann windows, and the multiple coherence.
 
     γ²_j = S_yu S_uu⁻¹ S_uy / S_yy of output j: the share of its power that is linear in the inputs.
@@ -92,11 +92,11 @@ def frequency_responses(records: Sequence[Record]) -> FrequencyResponses:
     coherence = np.divide(explained, outputs, out=np.full_like(explained, np.nan), where=outputs > 0.0)
     apart &= excited | (coherence > SPECTRA.coherent).any(axis=1)
     values = np.where(apart[:, None, None], scaled / scales[:, None], np.nan)
-    found = TransferFunctions(values.transpose(1, 2, 0), lines, first.output_channels, names, name=first.name)
+    found = FrequencyResponses(values.transpose(1, 2, 0), lines, first.output_channels, names, name=first.name)
     coherence = np.where(apart[:, None], np.clip(coherence, 0.0, 1.0), np.nan).T
     silent = tuple(name for i, name in enumerate(first.input_names) if i not in active)
     units = tuple(first.input_channels[i].unit for i in active)
-    return FrequencyResponses(found, coherence, averages, units, silent)
+    return FrfEstimate(found, coherence, averages, units, silent)
 
 
 def _averaged(records: Sequence[Record], active: Sequence[int], segment: int) -> tuple[np.ndarray, int]:

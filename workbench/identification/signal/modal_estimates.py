@@ -94,7 +94,7 @@ class ParticipatingModes(ModalEstimates):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Refined(ModalEstimates):
+class RefinedModes(ModalEstimates):
     """Maximum likelihood modes of free decays, with their standard errors.
 
     Attributes:
@@ -118,7 +118,7 @@ class Refined(ModalEstimates):
     converged: bool
     steps: int
 
-    def select(self, which: np.ndarray) -> "Refined":
+    def select(self, which: np.ndarray) -> "RefinedModes":
         """Some of the modes, by index, as they were fitted together with the others."""
         both = np.r_[which, which + self.modes.n_modes]
         return replace(
@@ -152,10 +152,10 @@ class Refined(ModalEstimates):
         return np.asarray(np.sqrt((self.shape_factor**2).sum(axis=2) + self.shape_variance).T)
 
 
-class OfRefined(ModalEstimates):
+class RefinedEstimates(ModalEstimates):
     """A result that contains refined modes and presents their estimates and errors as its own."""
 
-    refined: Refined
+    refined: RefinedModes
 
     @property
     def modes(self) -> SampledModes:  # type: ignore[override]  # read-only here
@@ -177,11 +177,11 @@ class OfRefined(ModalEstimates):
         return self.refined.shape_std
 
 
-ShapeEstimates = Refined | OfRefined | ParticipatingModes  # those with a covariance of the shapes
+ShapeEstimates = RefinedModes | RefinedEstimates | ParticipatingModes  # those with a covariance of the shapes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Identified(OfRefined):
+class IdentifiedModes(RefinedEstimates):
     """The modes of a record, and the candidates rejected as noise.
 
     Attributes:
@@ -193,7 +193,7 @@ class Identified(OfRefined):
         remarks: on searches that the time limit ended early, among others.
     """
 
-    refined: Refined
+    refined: RefinedModes
     statistic: np.ndarray
     threshold: float
     noise_modes: SampledModes
@@ -202,7 +202,7 @@ class Identified(OfRefined):
 
     evidence, limit, noise_evidence = Renamed("statistic"), Renamed("threshold"), Renamed("noise_statistic")
 
-    def without_artefacts(self, nyquist: float, *, growing: bool = False) -> "Identified":
+    def without_artefacts(self, nyquist: float, *, growing: bool = False) -> "IdentifiedModes":
         """Only poles that can be modes (`credible`); the others join `noise_modes`.
 
         Args:

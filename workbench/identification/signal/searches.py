@@ -250,7 +250,7 @@ Model = TypeVar("Model")
 Candidate = TypeVar("Candidate")
 
 
-class Once:
+class CachedResidual:
     """A function for the residual (n,) and its Jacobian (n, n_unknowns) that keeps its last value.
 
     SciPy's least squares asks for both at the same unknowns in turn; here they are computed together.

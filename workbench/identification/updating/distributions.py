@@ -455,7 +455,7 @@ def compared(
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Identified(Printed):
+class IdentifiedStructure(Printed):
     """A structure identified with the number of terms of the best self-check.
 
     Attributes:
@@ -493,7 +493,7 @@ def choose_terms(
     first_mode: int = 0,
     prior_mass: ProfileLike = 0.0,
     prior_stiffness: ProfileLike = 0.0,
-) -> Identified:
+) -> IdentifiedStructure:
     """The identified structure of the numbers of terms whose modes agree best with the measured ones.
 
     A pair of more terms must halve the largest frequency error to be preferred, and none is once this is below the
@@ -511,7 +511,7 @@ def choose_terms(
         ValueError: no pair of numbers gives a structure; the last reason is given.
         UserWarning: as `mass_and_stiffness`.
     """
-    best: Identified | None = None
+    best: IdentifiedStructure | None = None
     tried, reason, numbers = [], "no number of terms was given", tuple(terms)
     measurement_error = 1e-9  # of modes that were computed
     if measured.covariance is not None:
@@ -530,7 +530,7 @@ def choose_terms(
         if np.isfinite(check.worst) and (
             best is None or (measurement_error < best.check.worst and check.worst < 0.5 * best.check.worst)
         ):
-            best = Identified(found, pair, check)
+            best = IdentifiedStructure(found, pair, check)
     if best is None:
         raise ValueError(f"no number of terms gives a structure: {reason}")
     return replace(best, tried=tuple(tried))

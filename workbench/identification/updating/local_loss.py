@@ -19,8 +19,8 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.stats import chi2 as chi2_distribution
 
-from workbench.identification.signal.modal_estimates import Refined
-from workbench.identification.signal.searches import Once
+from workbench.identification.signal.modal_estimates import RefinedModes
+from workbench.identification.signal.searches import CachedResidual
 from workbench.identification.updating.distributions import Basis
 from workbench.identification.updating.sensitivity import LocalLoss
 from workbench.identification.updating.structure_fit import (
@@ -157,7 +157,7 @@ class LocatedDamage(Printed):
 @warns_of_remarks
 @one_blas_thread
 def locate_damage(
-    measured: Refined,
+    measured: RefinedModes,
     nominal: Bar | Beam,
     *,
     basis: Callable[[int], Basis] | None = None,
@@ -392,7 +392,7 @@ def _fit_near_mass(problem: Problem, near: FittedStructure, part: PointMass) -> 
 
     start = np.r_[free_near(problem, near), np.clip([part.at, part.pair[0]] / scale, 1e-4, [1.0 - 1e-4, np.inf])]
     bounds = np.r_[np.full(n_free, -np.inf), least], np.r_[np.full(n_free, np.inf), most]
-    z = Once(fit).least(start, PROBLEM.most_steps, bounds=bounds, ftol=1e-5)
+    z = CachedResidual(fit).least(start, PROBLEM.most_steps, bounds=bounds, ftol=1e-5)
     found = report(_with_point_mass(problem, *(z[-2:] * scale)), z[:-2])
     return replace(
         found,

@@ -14,8 +14,8 @@ import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
 from workbench.arrays import Floats, symmetric_root
-from workbench.identification.signal.modal_estimates import Refined
-from workbench.identification.signal.searches import Once
+from workbench.identification.signal.modal_estimates import RefinedModes
+from workbench.identification.signal.searches import CachedResidual
 from workbench.identification.updating.distributions import Basis, SelfCheck, columns
 from workbench.identification.updating.sensitivity import LocalLoss
 from workbench.identification.updating.structure_problem import PROBLEM, GaussianPrior, Problem, Task
@@ -176,7 +176,7 @@ def fitted(problem: Problem, near: FittedStructure | None = None, loss: LocalLos
         return report(problem, z)
     if near is not None and not problem.residuals(z)[1].any():
         z[: problem.n_free] = problem.start()  # with other terms the earlier fit may not be positive
-    residuals = Once(problem.residuals)
+    residuals = CachedResidual(problem.residuals)
 
     def search(z: np.ndarray) -> np.ndarray:
         tolerances = {"ftol": 1e-5, "xtol": 1e-9, "gtol": 1e-9}
@@ -277,7 +277,7 @@ def _uncertain(
 @warns_of_remarks
 @one_blas_thread
 def fit_structure(
-    measured: Refined,
+    measured: RefinedModes,
     nominal: Bar | Beam,
     *,
     mass: Basis,
@@ -313,7 +313,7 @@ def fit_structure(
 @warns_of_remarks
 @one_blas_thread
 def choose_structure(
-    measured: Refined,
+    measured: RefinedModes,
     nominal: Bar | Beam,
     *,
     basis: Callable[[int], Basis] | None = None,

@@ -19,7 +19,7 @@ from scipy.optimize import linear_sum_assignment
 
 from workbench.arrays import Floats, scaled_inverse
 from workbench.identification.shapes.eigenfunctions import check_along
-from workbench.identification.signal.modal_estimates import Refined, normalised_shapes
+from workbench.identification.signal.modal_estimates import RefinedModes, normalised_shapes
 from workbench.identification.updating.distributions import Basis, held_exactly, known_values
 from workbench.identification.updating.sensitivity import LocalLoss, SeriesStructure
 from workbench.structure.domain import Interval
@@ -87,7 +87,7 @@ class Task:
         unit_shapes: likewise of the shape of each mode at all sensors but its reference.
     """
 
-    measured: Refined
+    measured: RefinedModes
     nominal: Bar | Beam
     known: tuple[tuple[np.ndarray, Floats], tuple[np.ndarray, Floats]]
     priors: tuple[GaussianPrior | None, GaussianPrior | None]
@@ -100,7 +100,7 @@ class Task:
     @classmethod
     def of(
         cls,
-        measured: Refined,
+        measured: RefinedModes,
         nominal: Bar | Beam,
         known_mass: Sequence[tuple[float, float]] = (),
         known_stiffness: Sequence[tuple[float, float]] = (),
@@ -147,7 +147,7 @@ class Task:
         return float(np.log(self.n_data))
 
 
-def _paired(measured: Refined, nominal: Bar | Beam) -> np.ndarray:
+def _paired(measured: RefinedModes, nominal: Bar | Beam) -> np.ndarray:
     """Index of the nominal structure's elastic mode paired with each measured one by shape, (n_modes,), from 0."""
     modes, none = measured.modes, Basis.polynomial(0)
     n = modes.n_modes + 4

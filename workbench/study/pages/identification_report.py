@@ -7,23 +7,23 @@ from typing import Any
 import numpy as np
 
 from workbench.identification.ambient import AmbientModes, identify_ambient
-from workbench.identification.driven import Driven, identify_driven
+from workbench.identification.driven import DrivenModes, identify_driven
 from workbench.identification.free_decay.assumptions import AmplitudeDependence, ProportionalFit
+from workbench.identification.frf import FrfModes, identify_frf
 from workbench.identification.ring_down import RingDown, by_remark, ring_down
 from workbench.identification.signal.data_quality import check_data_quality
 from workbench.identification.signal.harmonics import MAINS_HZ
 from workbench.identification.signal.modal_estimates import ModalEstimates, rounded, rows_of
 from workbench.identification.signal.searches import SECONDS, STOPPED, Progress
-from workbench.identification.transfer import TransferModes, identify_transfer
+from workbench.records.frequency_responses import FrequencyResponses
 from workbench.records.record import Channel, Record
-from workbench.records.transfer_functions import TransferFunctions
 from workbench.structure.printed import counted
 
 TURN = 2.0 * np.pi
 UNLIKELY, MOST_MODES = 0.01, 40
-IMPLAUSIBLE_DAMPING = 0.1  # damping ratio above which a mode of transfer functions is doubtful
+IMPLAUSIBLE_DAMPING = 0.1  # damping ratio above which a mode of FRFs is doubtful
 SURE = 3.0
-LINES = 2049  # of the transfer functions of a model, besides those about its modes
+LINES = 2049  # of the FRFs of a model, besides those about its modes
 COLLINEAR = 0.8  # modal phase collinearity below which a shape counts as complex
 
 
@@ -37,7 +37,7 @@ class IdentificationReport:
         lines: remarks.
         content: for JSON.
         decays: the free decays, or the correlation functions, that were fitted; empty for other data.
-        fitted: transfer functions of the model, at the fitted lines, or of driven records up to half the sample rate;
+        fitted: FRFs of the model, at the fitted lines, or of driven records up to half the sample rate;
             None for other data.
     """
 
@@ -46,11 +46,11 @@ class IdentificationReport:
     lines: tuple[str, ...]
     content: dict[str, Any]
     decays: tuple[Record, ...] = ()
-    fitted: TransferFunctions | None = None
+    fitted: FrequencyResponses | None = None
 
 
 def identification_report(
-    measured: Sequence[Record | TransferFunctions],
+    measured: Sequence[Record | FrequencyResponses],
     *,
     start: float | None = None,
     n_modes: int | None = None,
@@ -59,37 +59,37 @@ def identification_report(
     seconds: float = SECONDS,
     progress: Progress | None = None,
 ) -> IdentificationReport:
-    """The report of the modes of transfer functions or records.
+    """The report of the modes of FRFs or records.
 
     Records with inputs other than zero are driven; others are ambient with `ambient`, else free decays.
 
     Args:
-        measured: records of the same sensors at one sample rate, or one set of transfer functions.
+        measured: records of the same sensors at one sample rate, or one set of FRFs.
         start: time from which records are used, s.
-        n_modes: number of modes; the largest number for driven records and transfer functions.
+        n_modes: number of modes; the largest number for driven records and FRFs.
         ambient: whether unknown broadband forces drive the whole record.
-        band_hz: lowest and highest line to fit, of transfer functions.
+        band_hz: lowest and highest line to fit, of FRFs.
         seconds: limit of processor time, after which the best result so far is reported.
         progress: as in `identify_driven`.
 
     Raises:
-        ValueError: as `ring_down`, `identify_driven`, `identify_ambient`, `identify_transfer`; two ambient records, or
+        ValueError: as `ring_down`, `identify_driven`, `identify_ambient`, `identify_frf`; two ambient records, or
             one with inputs; options of the other kind of data.
     """
     on: dict[str, Any] = {"seconds": seconds, "progress": progress}
-    transfer = [one for one in measured if isinstance(one, TransferFunctions)]
-    if transfer:
+    frf = [one for one in measured if isinstance(one, FrequencyResponses)]
+    if frf:
         if len(measured) > 1:
-            raise ValueError(f"transfer functions are identified from one file; got {len(measured)} files")
+            raise ValueError(f"FRFs are identified from one file; got {len(measured)} files")
         if start is not None or ambient:
-            raise ValueError("transfer functions have no time: leave --start and --ambient out; --band-hz sets a band")
-        one, most = transfer[0], MOST_MODES if n_modes is None else n_modes
-        found = identify_transfer(
+            raise ValueError("FRFs have no time: leave --start and --ambient out; --band-hz sets a band")
+        one, most = frf[0], MOST_MODES if n_modes is None else n_modes
+        found = identify_frf(
             one.values, one.frequencies_hz, channels=one.output_channels, band_hz=band_hz, max_modes=most, **on
         )
-        return of_transfer(found, one)
+        return of_frfs(found, one)
     if band_hz is not None:
-        raise ValueError("--band-hz is for transfer functions; for a record, resample it or identify all its modes")
+        raise ValueError("--band-hz is for FRFs; for a record, resample it or identify all its modes")
     records = [one for one in measured if isinstance(one, Record)]
     if not ambient and not any(record.inputs.any() for record in records):
         return of_ring_down(ring_down(records, start=start, n_modes=n_modes, **on))
@@ -138,7 +138,7 @@ def of_ring_down(decay: RingDown) -> IdentificationReport:
     return _report(decay.records, found, lines, content, decay.records)
 
 
-def of_driven(found: Driven, records: Sequence[Record]) -> IdentificationReport:
+def of_driven(found: DrivenModes, records: Sequence[Record]) -> IdentificationReport:
     """The report of driven records."""
     lines = [*found.remarks, *_on_convergence(found.converged, found.remarks, "try other --modes")]
     a, b, c, d = (getattr(found.state_space, name) for name in "ABCD")
@@ -153,8 +153,8 @@ def of_driven(found: Driven, records: Sequence[Record]) -> IdentificationReport:
     return replace(_report(records, found, lines, content), fitted=_model_of(found))
 
 
-def _model_of(found: Driven) -> TransferFunctions:
-    """The transfer functions of the model as those of records are: with the hold of the inputs, and their delays."""
+def _model_of(found: DrivenModes) -> FrequencyResponses:
+    """The FRFs of the model as those of records are: with the hold of the inputs, and their delays."""
     dt, hertz = found.sample_time, found.modes.frequencies_hz
     nyquist, width = 0.5 / dt, found.modes.zeta * hertz
     # as close about a peak as it is narrow
@@ -170,7 +170,7 @@ def _model_of(found: Driven) -> TransferFunctions:
     )
     late = np.exp(-s * found.delays[:, None])
     names = tuple(channel.name for channel in found.input_channels)
-    return TransferFunctions(values * late, lines, found.output_channels, names)
+    return FrequencyResponses(values * late, lines, found.output_channels, names)
 
 
 def _on_convergence(converged: bool, remarks: Sequence[str], remedy: str) -> list[str]:
@@ -186,8 +186,8 @@ def of_ambient(found: AmbientModes, record: Record) -> IdentificationReport:
     return _report([record], found, lines, _content(record.output_channels, found), found.correlations)
 
 
-def of_transfer(found: TransferModes, measured: TransferFunctions) -> IdentificationReport:
-    """The report of transfer functions."""
+def of_frfs(found: FrfModes, measured: FrequencyResponses) -> IdentificationReport:
+    """The report of FRFs."""
     remedy = "try other --modes, or a narrower --band-hz"
     lines = [*found.remarks, *_on_convergence(found.converged, found.remarks, remedy)]
     broad = np.flatnonzero(found.modes.zeta > IMPLAUSIBLE_DAMPING)
@@ -231,7 +231,7 @@ def of_transfer(found: TransferModes, measured: TransferFunctions) -> Identifica
         )
     band = found.frequencies_hz
     outputs, inputs = found.modes.n_outputs, len(measured.references)
-    heading = f"transfer functions of {counted(outputs, 'output')} and {counted(inputs, 'input')}"
+    heading = f"FRFs of {counted(outputs, 'output')} and {counted(inputs, 'input')}"
     heading += f", {band.size} lines from {band[0]:.6g} to {band[-1]:.6g} Hz"
     content = {
         **_content(measured.output_channels, found),

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from workbench.draw.signals import MOST_INPUTS, plot_frf_of_inputs
-from workbench.identification.signal.frequency_responses import FrequencyResponses, frequency_responses, loudest
+from workbench.identification.signal.frequency_responses import FrfEstimate, frequency_responses, loudest
+from workbench.records.frequency_responses import FrequencyResponses
 from workbench.records.record import Record
-from workbench.records.transfer_functions import TransferFunctions
 from workbench.structure.printed import counted, joined_in_words
 from workbench.study.pages.page import block
 
@@ -14,7 +14,7 @@ MOST_OUTPUTS = 4  # with a panel each
 
 
 def responses_to_inputs(
-    records: Sequence[Record], fitted: TransferFunctions | None = None
+    records: Sequence[Record], fitted: FrequencyResponses | None = None
 ) -> tuple[list[dict[str, Any]], str]:
     """The block of the frequency responses to several inputs; else none, and a sentence that says why.
 
@@ -32,8 +32,8 @@ def responses_to_inputs(
     return [block(plot_frf_of_inputs(found, fitted), _caption(found, records, fitted))], ""
 
 
-def _caption(found: FrequencyResponses, records: Sequence[Record], fitted: TransferFunctions | None) -> str:
-    inputs, n_outputs = found.transfer.references, records[0].n_outputs
+def _caption(found: FrfEstimate, records: Sequence[Record], fitted: FrequencyResponses | None) -> str:
+    inputs, n_outputs = found.frf.references, records[0].n_outputs
     over = f" of {len(records)} records" if len(records) > 1 else ""
     words = [
         f"Frequency responses to {counted(len(inputs), 'input')} at once, H = S_yu S_uu⁻¹, by spectra averaged over"
@@ -41,7 +41,7 @@ def _caption(found: FrequencyResponses, records: Sequence[Record], fitted: Trans
         ", and those of the identified modes (dashed)." if fitted is not None else ".",
         " Below, the multiple coherence: the share of each output's power that is linear in the inputs.",
     ]
-    if n_outputs > len(found.transfer.output_names):
+    if n_outputs > len(found.frf.output_names):
         words.append(f" Shown are {MOST_OUTPUTS} of {n_outputs} outputs, those of highest level first.")
     if len(inputs) > MOST_INPUTS:
         words.append(f" Not drawn: the responses to {joined_in_words(inputs[MOST_INPUTS:])}.")

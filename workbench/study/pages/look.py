@@ -14,11 +14,11 @@ from scipy.ndimage import median_filter
 from scipy.signal import find_peaks
 
 from workbench.draw.plot import plot
-from workbench.draw.signals import SEGMENTS, plot_frf, plot_spectra, plot_transfer, power_spectrum
+from workbench.draw.signals import SEGMENTS, plot_frf, plot_frf_matrix, plot_spectra, power_spectrum
 from workbench.identification.free_decay.preparation import decay_start, decays
 from workbench.identification.signal.data_quality import DataFault, data_faults, input_faults
+from workbench.records.frequency_responses import FrequencyResponses
 from workbench.records.record import Channel, Record
-from workbench.records.transfer_functions import TransferFunctions
 from workbench.structure.printed import counted
 from workbench.study.pages.inputs_at_once import responses_to_inputs
 from workbench.study.pages.page import PageContent, block
@@ -53,10 +53,10 @@ class Look:
     page_content: PageContent
 
 
-def look_at(measured: Record | TransferFunctions, path: Path) -> Look:
-    """The report of a record or of transfer functions read from `path`."""
-    if isinstance(measured, TransferFunctions):
-        return _transfer(measured, path)
+def look_at(measured: Record | FrequencyResponses, path: Path) -> Look:
+    """The report of a record or of FRFs read from `path`."""
+    if isinstance(measured, FrequencyResponses):
+        return _frfs(measured, path)
     return _record(measured, path)
 
 
@@ -68,7 +68,7 @@ def _record(record: Record, path: Path) -> Look:
     applied = {c.name for c in record.output_channels if c.quantity == "force" or FORCES.search(c.name)} - faulty
     applied -= set(doubtful)
     forces = [] if record.n_inputs else [name for name in record.output_names if name in applied]
-    # constant stretches are no fault of a force: it may be zero for long, or held from sample to sample
+    # constant segments are no fault of a force: it may be zero for long, or held from sample to sample
     faults = [fault for fault in faults if fault.outputs[-1] not in forces]
     faulty |= {fault.outputs[-1] for fault in faults if fault.kind == "unstated"}
     kept = [name for name in record.output_names if name not in faulty | set(forces)]
@@ -167,7 +167,7 @@ def _quiet(record: Record) -> list[DataFault]:
     return faults
 
 
-def _transfer(measured: TransferFunctions, path: Path) -> Look:
+def _frfs(measured: FrequencyResponses, path: Path) -> Look:
     lines = measured.frequencies_hz
     rows = []
     for channel, row in zip(measured.output_channels, np.abs(measured.values), strict=True):
@@ -177,7 +177,7 @@ def _transfer(measured: TransferFunctions, path: Path) -> Look:
         rows.append((channel.name, "magnitude", *(f"{v:.4g}" for v in (row.min(), row.max(), row.mean(), rms)), at))
     n, m = len(measured.output_channels), len(measured.references)
     heading = (
-        f"transfer functions of {counted(n, 'output')} and {counted(m, 'input')}, {lines.size} lines from"
+        f"FRFs of {counted(n, 'output')} and {counted(m, 'input')}, {lines.size} lines from"
         f" {lines[0]:.6g} to {lines[-1]:.6g} Hz"
     )
     command = shlex.join(["workbench", "identify", str(path)])
@@ -185,7 +185,7 @@ def _transfer(measured: TransferFunctions, path: Path) -> Look:
         title=f"What {path.name} holds",
         lead=heading,
         lines=[*measured.remarks, f"Go on with: {command}"],
-        blocks=[block(plot_transfer(measured), "Magnitude and phase of the transfer functions.")],
+        blocks=[block(plot_frf_matrix(measured), "Magnitude and phase of the FRFs.")],
         tables=[("Channels", HEADINGS, rows)],
         made_by=f"workbench look {path}",
     )

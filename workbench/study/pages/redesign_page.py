@@ -114,8 +114,8 @@ def _replayed(found: Redesign, record: Record) -> list[dict[str, Any]]:
     if abs(record.sample_time / step - 1.0) > 1e-6:
         return []
     inputs = record.inputs[:, :MOST]
-    ports = tuple(Actuator(a.name, a.at, quantity=a.quantity, direction=a.direction) for a in rig.actuators)
-    test = LoopTest(inputs.shape[1], step, forces=inputs, ports=ports, seed=found.test.seed)
+    exciters = tuple(Actuator(a.name, a.at, quantity=a.quantity, direction=a.direction) for a in rig.actuators)
+    test = LoopTest(inputs.shape[1], step, forces=inputs, exciters=exciters, seed=found.test.seed)
     old, new = run_loop(rig, found.present, test), run_loop(rig, found.redesigned, test)
     if not (old.bounded or new.bounded):
         return []

@@ -1,4 +1,4 @@
-"""Transfer functions from the arrays of a file, or from the columns of a table."""
+"""FRFs from the arrays of a file, or from the columns of a table."""
 
 import json
 import re
@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from workbench.records.assembly import legible, unit_remark
+from workbench.records.frequency_responses import FrequencyResponses
 from workbench.records.limits import RecordFileError
 from workbench.records.record import Channel
-from workbench.records.transfer_functions import TransferFunctions
 from workbench.records.units import BRACKETED, split_unit, unit_named
 
 # Names, in small letters, that programs use for the lines, the sample rate, and the places of the points.
@@ -29,13 +29,13 @@ COLUMN = re.compile(
 )
 COHERENCE = re.compile(r"(?:.*[ ._])?(?:coh|coherence|γ²|gamma\^?2)(?:[ ._\d].*)?", re.IGNORECASE)
 DECIBEL = re.compile(r"(.+?)\s*[\[(]\s*dB\s*[\])]", re.IGNORECASE)
-DESCRIPTION = "transfer_header"
+DESCRIPTION = "frf_header"
 TURN = 2.0 * np.pi * (1.0 + 1e-6)  # rad: a larger phase without a unit is in degrees
 REAL = 1e-6  # largest relative imaginary part of a real line
 
 
-def holds_transfer(arrays: Mapping[str, np.ndarray]) -> bool:
-    """Whether an array is complex, so that the file has transfer functions and not a record."""
+def holds_frfs(arrays: Mapping[str, np.ndarray]) -> bool:
+    """Whether an array is complex, so that the file has FRFs and not a record."""
     return any(values.dtype.kind == "c" and values.size > 1 for values in arrays.values())
 
 
@@ -84,7 +84,7 @@ def complex_columns(path: Path, signals: Mapping[str, np.ndarray]) -> dict[str, 
     pairs = [sorted(part) for part in parts.values()]
     if sum(map(len, pairs)) != len(names) - 1 or not all(pair in ([2, 3], [4, 5]) for pair in pairs):
         raise RecordFileError(
-            f"{path} begins with frequencies, {names[0]!r}, and is no record; transfer functions need two columns each,"
+            f"{path} begins with frequencies, {names[0]!r}, and is no record; FRFs need two columns each,"
             f" NAME real and NAME imag, or NAME magnitude and NAME phase [deg]; got {', '.join(names[1:7])}"
         )
     lines = signals[names[0]]
@@ -122,10 +122,8 @@ def _split_ratio(name: str) -> tuple[str, str, str]:
     return (found[1], top, bottom) if unit_named(top) and unit_named(bottom) else (name, "", "")
 
 
-def transfer_of(
-    path: Path, arrays: Mapping[str, np.ndarray], *, sample_rate_hz: float | None = None
-) -> TransferFunctions:
-    """The transfer functions in the arrays of a file.
+def frfs_of(path: Path, arrays: Mapping[str, np.ndarray], *, sample_rate_hz: float | None = None) -> FrequencyResponses:
+    """The FRFs in the arrays of a file.
 
     Args:
         path: of the file, for messages.
@@ -148,7 +146,7 @@ def transfer_of(
     points = list(spectra) if len(spectra) > 1 else [f"{name} {i + 1}" for i in range(len(values))]
     channels, references, remarks = _points(path, arrays, points, values.shape[1])
     try:
-        return TransferFunctions(values, lines, channels, references, path.stem, (*remarks, *assumed))
+        return FrequencyResponses(values, lines, channels, references, path.stem, (*remarks, *assumed))
     except ValueError as error:
         raise RecordFileError(f"{path}: {error}") from error
 
@@ -189,7 +187,7 @@ def _lines_of_rate(
     Args:
         path: of the file.
         real: its vectors and single values by name, the sample rate or the number of samples perhaps among them.
-        found: the transfer functions.
+        found: the FRFs.
         sample_rate_hz: as given.
     """
     scalars = {name.lower(): float(values[0]) for name, values in real.items() if values.size == 1}
@@ -201,7 +199,7 @@ def _lines_of_rate(
     if rate is None:
         name = next(iter(found))
         raise RecordFileError(
-            f"{path}, {name!r} is complex: transfer functions? The file has no lines; add them as an array"
+            f"{path}, {name!r} is complex: FRFs? The file has no lines; add them as an array"
             " 'frequency_hz', or give the sample rate if they go from zero to half of it"
         )
     if not 0 < rate < np.inf:

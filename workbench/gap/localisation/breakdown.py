@@ -8,8 +8,8 @@ import numpy as np
 
 from workbench.arrays import Flags, Floats
 from workbench.gap.effects.effect import Effect
-from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.force_location import ForceLocation
+from workbench.gap.localisation.force_reconstruction import ForceReconstruction
 from workbench.gap.prediction.residuals import scale_of
 from workbench.identification.signal.distortion import distortion_of, period_of
 from workbench.records.record import Record
@@ -18,7 +18,7 @@ from workbench.rig.rig import Rig, participation_of
 
 
 @dataclass(frozen=True)
-class WhereSettings:
+class BreakdownSettings:
     """Constants of the breakdown of the gap."""
 
     mode_share: float = 0.05  # of the gap: modes with more are named
@@ -40,12 +40,12 @@ class WhereSettings:
     periods: int = 3  # last periods of a record that are used; the first of them only for the drift
 
 
-WHERE = WhereSettings()
+BREAKDOWN = BreakdownSettings()
 RIDGES = np.logspace(-9, -1, 9)  # ridge parameters, of the largest eigenvalue, for cross-validation
 
 
 @dataclass(frozen=True, eq=False)
-class Where:
+class GapBreakdown:
     """Breakdown of the gap of the nominal model.
 
     Shares are of the squared residual above the noise, each sensor scaled by its own standard deviation, over the
@@ -92,7 +92,7 @@ class Where:
     @property
     def is_distorted(self) -> bool:
         """Whether periodic inputs show a nonlinearity, before any law is assumed."""
-        return bool(self.distortions.max() > WHERE.distorted)
+        return bool(self.distortions.max() > BREAKDOWN.distorted)
 
     @property
     def at(self) -> Any:
@@ -112,20 +112,20 @@ class Where:
 
 def _is_clear(gaps: Floats, floors: Floats) -> Flags:
     """Whether the gap of each record (n_records,) is clearly above its noise."""
-    return np.asarray(gaps > (1.0 + WHERE.clear) * floors)
+    return np.asarray(gaps > (1.0 + BREAKDOWN.clear) * floors)
 
 
-def locate(evidence: Evidence, effects: Sequence[Effect], place: ForceLocation) -> Where:
+def break_down(reconstruction: ForceReconstruction, effects: Sequence[Effect], place: ForceLocation) -> GapBreakdown:
     """Break down the gap on the fit records.
 
     Args:
-        evidence: of the nominal rig.
+        reconstruction: of the nominal rig.
         effects: that explain the gap, if known; they give the path.
         place: of an unmodelled force, located without faulty sensors.
     """
-    rig, data = evidence.rig, evidence.data
+    rig, data = reconstruction.rig, reconstruction.data
     scales = [scale_of(record.outputs) for record in data.counted]
-    scaled = [r / scale for r, scale in zip(evidence.residuals, scales, strict=True)]
+    scaled = [r / scale for r, scale in zip(reconstruction.residuals, scales, strict=True)]
     floors = np.array([(data.noise / scale[:, 0]) ** 2 for scale in scales])
     excess = np.array([(s**2).mean(axis=1) for s in scaled]) - floors
     gaps = np.array([np.sqrt((s**2).mean()) for s in scaled])
@@ -138,14 +138,14 @@ def locate(evidence: Evidence, effects: Sequence[Effect], place: ForceLocation) 
     mode_shares, above = _by_mode(frequencies, seen)
     in_band = np.where(frequencies > 0, mode_shares, mode_shares[frequencies == 0].sum())
     fastest = min(record.sample_time for record in data.counted)
-    octaves = np.r_[0.0, 0.5 / fastest * 2.0 ** np.arange(1 - WHERE.octaves, 1)]
+    octaves = np.r_[0.0, 0.5 / fastest * 2.0 ** np.arange(1 - BREAKDOWN.octaves, 1)]
     levels = np.array([np.sqrt(np.mean(record.inputs**2)) for record in data.counted])
-    both = list(zip(data.counted, evidence.residuals, strict=True))
+    both = list(zip(data.counted, reconstruction.residuals, strict=True))
     share = linear_share(rig, [both[i] for i in with_gap], mode_shares)
     distortions = np.array([_distortion(rig, record, residual) for record, residual in both])
-    return Where(
-        path=_path(evidence, excess, floors.mean(axis=1), by_sensor, effects),
-        modes=tuple(int(r) + 1 for r in np.flatnonzero(in_band > WHERE.mode_share)),
+    return GapBreakdown(
+        path=_path(reconstruction, excess, floors.mean(axis=1), by_sensor, effects),
+        modes=tuple(int(r) + 1 for r in np.flatnonzero(in_band > BREAKDOWN.mode_share)),
         amplitude_dependent=_amplitude_dependent(effects, gaps, noise, levels, share, distortions),
         mode_shares=mode_shares,
         share_above=above,
@@ -169,10 +169,10 @@ def _by_mode(frequencies: Floats, seen: Sequence[tuple[Floats, float, float]]) -
     Rigid modes share one band in equal parts; `seen` as of `_shares_between`.
     """
     elastic = frequencies[frequencies > 0]
-    first = WHERE.rigid * elastic[:1] * (elastic.size < frequencies.size)  # zero: an empty band
+    first = BREAKDOWN.rigid * elastic[:1] * (elastic.size < frequencies.size)  # zero: an empty band
     # geometric means, as the width of a peak is proportional to its frequency; `setup.comparison`, which compares whole
     # signals, takes arithmetic means
-    edges = np.r_[0.0, first, np.sqrt(elastic[1:] * elastic[:-1]), WHERE.above * elastic[-1:], np.inf]
+    edges = np.r_[0.0, first, np.sqrt(elastic[1:] * elastic[:-1]), BREAKDOWN.above * elastic[-1:], np.inf]
     rigid, *others = _shares_between(edges, seen)
     above = others.pop() if others else 0.0  # with only rigid modes, there is one band
     n_rigid = frequencies.size - len(others)
@@ -202,11 +202,13 @@ def _shares_of_eighths(scaled: Floats) -> Floats:
     return power / max(float(power.sum()), 1e-300)
 
 
-def _path(evidence: Evidence, excess: Floats, floors: Floats, power: Floats, effects: Sequence[Effect]) -> str:
+def _path(
+    reconstruction: ForceReconstruction, excess: Floats, floors: Floats, power: Floats, effects: Sequence[Effect]
+) -> str:
     """Path of the first effect, or a guess from the sensors and inputs that show the gap.
 
     Args:
-        evidence: of the nominal rig.
+        reconstruction: of the nominal rig.
         excess: (n_records, n_outputs) power above the noise, scaled.
         floors: (n_records,) power of the noise, likewise, the mean over sensors.
         power: (n_outputs,) above the noise in all records.
@@ -214,13 +216,13 @@ def _path(evidence: Evidence, excess: Floats, floors: Floats, power: Floats, eff
     """
     if effects:
         return effects[0].kind.path
-    left = np.concatenate([(r / evidence.data.noise[:, None]).ravel() for r in evidence.residuals])
-    if power.sum() <= 0 or evidence.data.by_channel(left).mean() < 1.03:
+    left = np.concatenate([(r / reconstruction.data.noise[:, None]).ravel() for r in reconstruction.residuals])
+    if power.sum() <= 0 or reconstruction.data.by_channel(left).mean() < 1.03:
         return "none"
     if of_one_sensor(power):
         return "sensor"
-    direct = {a.name for a in evidence.rig.actuators if a.direct}
-    for record, row, floor in zip(evidence.data.counted, excess, floors, strict=True):
+    direct = {a.name for a in reconstruction.rig.actuators if a.direct}
+    for record, row, floor in zip(reconstruction.data.counted, excess, floors, strict=True):
         active = {n for n, values in zip(record.input_names, record.inputs, strict=True) if np.any(values)}
         if active and active <= direct:
             return "structure" if row.mean() > 0.1 * floor else "actuator"
@@ -229,7 +231,7 @@ def _path(evidence: Evidence, excess: Floats, floors: Floats, power: Floats, eff
 
 def of_one_sensor(excess: np.ndarray) -> bool:
     """Whether one sensor alone disagrees, given the power above the noise of each (n_outputs,)."""
-    return bool(excess.max() > WHERE.one_sensor * excess.sum())
+    return bool(excess.max() > BREAKDOWN.one_sensor * excess.sum())
 
 
 def _amplitude_dependent(
@@ -240,10 +242,10 @@ def _amplitude_dependent(
         return any(effect.kind.nonlinear for effect in effects)
     above = np.sqrt(np.maximum(gaps**2 - floors**2, 0.0))
     sizes = above + floors
-    grows = sizes.max() > WHERE.louder * sizes.min() and above.max() > WHERE.louder * floors.max()
-    if grows or distortions.max() > WHERE.distorted:
+    grows = sizes.max() > BREAKDOWN.louder * sizes.min() and above.max() > BREAKDOWN.louder * floors.max()
+    if grows or distortions.max() > BREAKDOWN.distorted:
         return True
-    is_linear = linear > WHERE.linear and levels.max() > WHERE.louder * levels.min()
+    is_linear = linear > BREAKDOWN.linear and levels.max() > BREAKDOWN.louder * levels.min()
     return False if is_linear else None
 
 
@@ -254,16 +256,16 @@ def _distortion(rig: Rig, record: Record, residual: Floats) -> Floats:
     half their difference. A drift of a sensor is subtracted first.
     """
     period = period_of(record.inputs)
-    if period is None or record.n_samples < WHERE.periods * period:
+    if period is None or record.n_samples < BREAKDOWN.periods * period:
         return np.zeros(2)
-    last = slice(record.n_samples - WHERE.periods * period, None)
-    means = residual[:, last].reshape(residual.shape[0], WHERE.periods, period).mean(axis=2)
-    drift = (means[:, -1] - means[:, -2])[:, None] / period * np.arange(WHERE.periods * period)
+    last = slice(record.n_samples - BREAKDOWN.periods * period, None)
+    means = residual[:, last].reshape(residual.shape[0], BREAKDOWN.periods, period).mean(axis=2)
+    drift = (means[:, -1] - means[:, -2])[:, None] / period * np.arange(BREAKDOWN.periods * period)
     try:
         found = distortion_of(replace(record, inputs=record.inputs[:, last], outputs=residual[:, last] - drift))
     except ValueError:  # these few periods do not repeat well enough
         return np.zeros(2)
-    free = found.input_amplitudes < WHERE.silent * found.input_amplitudes.max()
+    free = found.input_amplitudes < BREAKDOWN.silent * found.input_amplitudes.max()
     octave = np.floor(np.log2(np.arange(1, free.size + 1)))  # noise of other bands may be far louder
     decay = float((rig.modes.zeta * rig.modes.omega).min()) * period * record.sample_time
     settled = np.tanh(0.5 * decay) ** 2
@@ -271,8 +273,8 @@ def _distortion(rig: Rig, record: Record, residual: Floats) -> Floats:
     for i, lines in enumerate((found.odd & free, found.even & free)):
         for each in range(int(octave[-1]) + 1):
             chosen = lines & (octave == each)
-            if chosen.sum() > WHERE.hum:
-                power = np.sort(found.amplitudes[:, chosen] ** 2, axis=1)[:, : -WHERE.hum].sum(axis=1)
+            if chosen.sum() > BREAKDOWN.hum:
+                power = np.sort(found.amplitudes[:, chosen] ** 2, axis=1)[:, : -BREAKDOWN.hum].sum(axis=1)
                 noise = np.maximum((found.noise[:, chosen] ** 2).sum(axis=1), 1e-300)
                 most[i] = max(most[i], settled * float((power / noise).max()))
     return most
@@ -290,7 +292,7 @@ def linear_share(rig: Rig, seen: Sequence[tuple[Record, Floats]], shares: Floats
         seen: records with their residuals (n_outputs, n_samples), measured minus predicted.
         shares: (n_modes,) of the gap around each mode; only the modes with the largest shares are used.
     """
-    chosen = [int(r) for r in np.argsort(-shares)[: WHERE.most_modes] if shares[r] > 0]
+    chosen = [int(r) for r in np.argsort(-shares)[: BREAKDOWN.most_modes] if shares[r] > 0]
     sizes = np.sqrt(np.mean([record.outputs.var(axis=1) for record, _ in seen], axis=0))[:, None]
     sizes = np.where(sizes > 0, sizes, 1.0)
     pieces = []
@@ -328,9 +330,9 @@ def _regressors(rig: Rig, chosen: Sequence[int], record: Record) -> np.ndarray:
         return record.inputs
     slowest = 2.0 * np.pi / (record.n_samples * record.sample_time)
     alone, acting = np.eye(len(rig.actuators)), participation_of(rig)
-    omega = np.maximum(rig.modes.omega[chosen], slowest)[:, None] * np.r_[np.ones(len(alone)), WHERE.spread]
+    omega = np.maximum(rig.modes.omega[chosen], slowest)[:, None] * np.r_[np.ones(len(alone)), BREAKDOWN.spread]
     damping = np.maximum(np.diag(rig.modes.damping)[chosen, None], 1e-3 * omega)
-    driven = np.array([row for r in chosen for row in (*alone, *[acting[r]] * len(WHERE.spread))])
+    driven = np.array([row for r in chosen for row in (*alone, *[acting[r]] * len(BREAKDOWN.spread))])
     resonators = modal_poles(omega.ravel(), np.diag(damping.ravel()))
     response_to = held_response if record.input_hold == "zero" else straight_response
     response, _ = response_to(resonators, record.inputs, driven, record.sample_time)

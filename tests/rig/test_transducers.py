@@ -169,7 +169,7 @@ def test_limits_that_are_not_positive_are_refused(field):
         Actuator("F1", 2.0, **{field: 0.0})
 
 
-def test_a_late_or_biased_port_has_no_state_space():
+def test_a_late_or_biased_transducer_has_no_state_space():
     assert Actuator("F1", 2.0, crosstalk=(("F2", 0.1),)).has_state_space
     assert Actuator("F1", 2.0).has_state_space and Sensor("d", 1.0, crosstalk=(("v", 0.1),)).has_state_space
     assert not Actuator("F1", 2.0, bias=1.0).has_state_space

@@ -23,11 +23,11 @@ from workbench.gap.prediction.unmodelled_force import (
 from workbench.gap.prediction.workers import ALONE, Workers
 from workbench.rig.motion import Motion
 from workbench.rig.rig import Rig
-from workbench.structure.domain import Between, Domain, Interval, NamedPoints, Rectangle, Where
+from workbench.structure.domain import Between, Domain, Interval, Location, NamedPoints, Rectangle
 
 
 @dataclass(frozen=True)
-class EvidenceSettings:
+class ReconstructionSettings:
     """Constants of the localisation of an unmodelled force by a Kalman filter."""
 
     levels: tuple[float, ...] = (1e-3, 1e-2, 1e-1, 1.0)  # rms of an unmodelled force over that of the inputs
@@ -47,12 +47,12 @@ class EvidenceSettings:
     many_points: int = 12  # named points up to which all are candidates
 
 
-EVIDENCE = EvidenceSettings()
+RECONSTRUCTION = ReconstructionSettings()
 FEWER_PLACES = 20  # of the grid, when some effects are given
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class ForceReconstruction:
     """The residual of a rig on the fit records, and the unmodelled force estimated from it.
 
     Attributes:
@@ -71,8 +71,8 @@ class Evidence:
     data: FitData
     motions: tuple[Motion, ...]
     residuals: tuple[np.ndarray, ...]
-    n_places: int = EVIDENCE.places
-    given_places: tuple[Where, ...] = ()
+    n_places: int = RECONSTRUCTION.places
+    given_places: tuple[Location, ...] = ()
     given_size: tuple[float, float] | None = None
     workers: Workers = ALONE
     absorbed: bool = False
@@ -82,21 +82,21 @@ class Evidence:
         cls,
         rig: Rig,
         data: FitData,
-        n_places: int = EVIDENCE.places,
+        n_places: int = RECONSTRUCTION.places,
         workers: Workers = ALONE,
         *,
         absorbed: bool = False,
-    ) -> "Evidence":
-        """The evidence of a rig, simulated on the fit records."""
+    ) -> "ForceReconstruction":
+        """The reconstruction with a rig, simulated on the fit records."""
         motions = data.motions(rig)
         return cls(rig, data, motions, tuple(data.differences(rig)), n_places, workers=workers, absorbed=absorbed)
 
-    def of_rig(self, rig: Rig) -> "Evidence":
-        """The evidence of another rig on the same records, given the size of the force."""
-        return replace(Evidence.of(rig, self.data, workers=self.workers), given_size=self.size)
+    def of_rig(self, rig: Rig) -> "ForceReconstruction":
+        """The reconstruction with another rig on the same records, given the size of the force."""
+        return replace(ForceReconstruction.of(rig, self.data, workers=self.workers), given_size=self.size)
 
-    def without(self, names: Collection[str]) -> "Evidence":
-        """The same evidence without some of the sensors, unless none would be left."""
+    def without(self, names: Collection[str]) -> "ForceReconstruction":
+        """The same reconstruction without some of the sensors, unless none would be left."""
         kept = [j for j, sensor in enumerate(self.rig.sensors) if sensor.name not in names]
         if len(kept) in (0, len(self.rig.sensors)):
             return self
@@ -108,8 +108,8 @@ class Evidence:
             residuals=tuple(residual[kept] for residual in self.residuals),
         )
 
-    def of_force_at(self, *places: Where) -> "Evidence":
-        """The same evidence of a force at known places."""
+    def of_force_at(self, *places: Location) -> "ForceReconstruction":
+        """The same reconstruction of a force at known places."""
         return replace(self, given_places=places, given_size=self.size)
 
     @property
@@ -122,7 +122,7 @@ class Evidence:
         """Of each record, s; those of clocks that agree to a millionth are one."""
         found: list[float] = []
         for dt in (record.sample_time for record in self.data.counted):
-            found.append(next((known for known in found if np.isclose(known, dt, EVIDENCE.one_rate, 0.0)), dt))
+            found.append(next((known for known in found if np.isclose(known, dt, RECONSTRUCTION.one_rate, 0.0)), dt))
         return tuple(found)
 
     @property
@@ -141,7 +141,7 @@ class Evidence:
         """That of the first record."""
         return self.models[self.sample_times[0]]
 
-    def filters_at(self, where: Where, size: tuple[float, float]) -> dict[float, ForceFilter]:
+    def filters_at(self, where: Location, size: tuple[float, float]) -> dict[float, ForceFilter]:
         """The filter for an unknown force at a place, by sample time.
 
         Args:
@@ -153,7 +153,7 @@ class Evidence:
         each = self.models.items()
         return {dt: wandering_force_filter(modes, model, shape, rms, time, dt) for dt, model in each}
 
-    def _log_likelihood(self, where: Where, size: tuple[float, float], n_records: int | None = None) -> float:
+    def _log_likelihood(self, where: Location, size: tuple[float, float], n_records: int | None = None) -> float:
         """Log-likelihood of an unknown force at a place, of a size as of `filters_at`, in the first or all records."""
         filters = self.filters_at(where, size)
         each = list(zip(self.sample_times, self.residuals, strict=True))[:n_records]
@@ -167,7 +167,9 @@ class Evidence:
         if isinstance(self.domain, NamedPoints):
             places: tuple[Any, ...] = (*self.domain.grid(), *self.domain.pairs())
             moved = [float(np.abs(self.rig.modes.phi_at(where)).max()) for where in places]
-            return tuple(where for where, size in zip(places, moved, strict=True) if size > EVIDENCE.still * max(moved))
+            return tuple(
+                where for where, size in zip(places, moved, strict=True) if size > RECONSTRUCTION.still * max(moved)
+            )
         return self.domain.grid(self._along)
 
     @cached_property
@@ -176,7 +178,7 @@ class Evidence:
         if isinstance(self.domain, Interval):
             return [float(x) for x in self.places[::2]]
         if isinstance(self.domain, NamedPoints):
-            many = len(self.domain.names) > EVIDENCE.many_points
+            many = len(self.domain.names) > RECONSTRUCTION.many_points
             return [p for p in self.peaks if not isinstance(p, Between)] if many else self.domain.grid()
         return self.domain.grid(6)
 
@@ -186,7 +188,11 @@ class Evidence:
         if self.given_size is not None:
             return self.given_size
         quick = max(2, len(self.residuals) - 2)
-        sizes = [(share * self.data.force_rms, memory) for memory in EVIDENCE.memories for share in EVIDENCE.levels]
+        sizes = [
+            (share * self.data.force_rms, memory)
+            for memory in RECONSTRUCTION.memories
+            for share in RECONSTRUCTION.levels
+        ]
 
         coarse = self._coarse_places
 
@@ -201,9 +207,9 @@ class Evidence:
         if isinstance(self.domain, Interval):
             every_fifth: Sequence[Any] = self.places[::5]
             return every_fifth
-        if isinstance(self.domain, NamedPoints) and len(self.domain.names) <= EVIDENCE.many_points:
+        if isinstance(self.domain, NamedPoints) and len(self.domain.names) <= RECONSTRUCTION.many_points:
             return self.domain.grid()
-        return self._likeliest_places[: EVIDENCE.most_peaks]
+        return self._likeliest_places[: RECONSTRUCTION.most_peaks]
 
     @cached_property
     def profile(self) -> np.ndarray:
@@ -223,12 +229,12 @@ class Evidence:
             for lines in lines_of(self.rig, model, [residual for own, residual in each if own == dt], dt)
         ]
 
-    def informative(self, where: Where) -> list[Lines]:
+    def informative(self, where: Location) -> list[Lines]:
         """The lines, weighted by the share of their power that is due to a force at a place."""
         shape = self.rig.modes.phi_at(where)
         return [each.weighted(each.force_share(shape)) for each in self.lines]
 
-    def misfit(self, where: Where, lines: Sequence[Lines] | None = None) -> float:
+    def misfit(self, where: Location, lines: Sequence[Lines] | None = None) -> float:
         """Residual sum of squares given one force of any law at a place, transients included, in units of the noise.
 
         Args:
@@ -257,7 +263,7 @@ class Evidence:
             return self._peaks_over(self.domain, ranked)
         pairs = [i for i, where in enumerate(ranked) if isinstance(where, Between)]
         points = [i for i, where in enumerate(ranked) if not isinstance(where, Between)]
-        most = len(points) if len(points) <= EVIDENCE.many_points else EVIDENCE.points_tried
+        most = len(points) if len(points) <= RECONSTRUCTION.many_points else RECONSTRUCTION.points_tried
         return tuple(ranked[i] for i in sorted((*points[:most], *self._distinct_pairs(ranked, pairs))))
 
     def _distinct_pairs(self, ranked: Sequence[Any], pairs: Sequence[int]) -> list[int]:
@@ -267,10 +273,10 @@ class Evidence:
         for i in pairs:
             shape = self.rig.modes.phi_at(ranked[i])
             shape = shape / max(float(np.linalg.norm(shape)), 1e-300)
-            if all((shape @ other) ** 2 < 1.0 - EVIDENCE.alike for other in shapes):
+            if all((shape @ other) ** 2 < 1.0 - RECONSTRUCTION.alike for other in shapes):
                 kept.append(i)
                 shapes.append(shape)
-            if len(kept) == EVIDENCE.pairs_tried:
+            if len(kept) == RECONSTRUCTION.pairs_tried:
                 break
         return kept
 
@@ -281,9 +287,14 @@ class Evidence:
 
     def _peaks_over(self, rectangle: Rectangle, ranked: Sequence[Any]) -> tuple[tuple[float, float], ...]:
         """Refined peaks over a rectangle, best first; mirrored places are tried too, as a plate is nearly symmetric."""
-        (a, b), peaks_found = rectangle.length, _spaced(ranked, rectangle, EVIDENCE.broad, EVIDENCE.most_peaks)
+        (a, b), peaks_found = (
+            rectangle.length,
+            _spaced(ranked, rectangle, RECONSTRUCTION.broad, RECONSTRUCTION.most_peaks),
+        )
         mirrored = [image for x, y in peaks_found for image in ((x, y), (a - x, y), (x, b - y), (a - x, b - y))]
-        offsets = max(a, b) / self._along * np.arange(-EVIDENCE.finer, EVIDENCE.finer + 1) / EVIDENCE.finer
+        offsets = (
+            max(a, b) / self._along * np.arange(-RECONSTRUCTION.finer, RECONSTRUCTION.finer + 1) / RECONSTRUCTION.finer
+        )
         around = [
             [(float(np.clip(x + dx, 0.0, a)), float(np.clip(y + dy, 0.0, b))) for dx in offsets for dy in offsets]
             for x, y in mirrored
@@ -292,7 +303,7 @@ class Evidence:
         refined = [places[int(np.argmin(row))] for places, row in zip(around, misfits, strict=True)]
         misfits_there = self.workers.map(self.misfit, refined)
         order = np.argsort(misfits_there, kind="stable")
-        return tuple(_spaced([refined[i] for i in order], rectangle, EVIDENCE.narrow, EVIDENCE.most_peaks))
+        return tuple(_spaced([refined[i] for i in order], rectangle, RECONSTRUCTION.narrow, RECONSTRUCTION.most_peaks))
 
     @cached_property
     def peaks(self) -> tuple[Any, ...]:
@@ -301,7 +312,7 @@ class Evidence:
             return self.given_places
         if not isinstance(self.domain, Interval):
             return self._likeliest_places
-        peaks_found = self.places[minima(-self.profile)[: EVIDENCE.most_peaks]]
+        peaks_found = self.places[minima(-self.profile)[: RECONSTRUCTION.most_peaks]]
         refined = self.workers.map(self._refined_peak, peaks_found)
         return tuple(at for at, _ in sorted(refined, key=lambda top: -top[1]))
 
@@ -310,9 +321,9 @@ class Evidence:
         spacing = self.places[1] - self.places[0]
         found = minimize_scalar(
             lambda x: -self._log_likelihood(x, self.size),
-            bounds=(at - EVIDENCE.beside * spacing, at + EVIDENCE.beside * spacing),
+            bounds=(at - RECONSTRUCTION.beside * spacing, at + RECONSTRUCTION.beside * spacing),
             method="bounded",
-            options={"xatol": EVIDENCE.resolved * spacing},
+            options={"xatol": RECONSTRUCTION.resolved * spacing},
         )
         return float(found.x), -float(found.fun)
 
@@ -322,7 +333,7 @@ class Evidence:
         _ = self.size  # computed once, before processes are forked
         return tuple(self.workers.map(self.place, self.peaks))
 
-    def place(self, where: Where) -> ForceAndMotion:
+    def place(self, where: Location) -> ForceAndMotion:
         """The smoothed unmodelled force at a place, and the motion there."""
         filters = self.filters_at(where, self.size)
         n, shape = self.rig.modes.n_modes, self.rig.modes.phi_at(where)

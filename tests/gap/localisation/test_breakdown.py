@@ -7,10 +7,10 @@ import pytest
 
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.localisation import force_lines
-from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.localisation.breakdown import break_down
 from workbench.gap.localisation.force_lines import lines_of
 from workbench.gap.localisation.force_location import locate_force
-from workbench.gap.localisation.where import locate
+from workbench.gap.localisation.force_reconstruction import ForceReconstruction
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import sampled_model
 from workbench.records.record import Channel, Record
@@ -40,17 +40,17 @@ def measured(record_of):
     return make
 
 
-def evidence(rig, records):
-    return Evidence.of(rig, FitData(tuple(records), np.full(len(rig.sensors), NOISE)))
+def reconstruction(rig, records):
+    return ForceReconstruction.of(rig, FitData(tuple(records), np.full(len(rig.sensors), NOISE)))
 
 
 def where(rig, records, faulty=()):
-    found = evidence(rig, records)
-    return locate(found, (), locate_force(found.without(faulty)))
+    found = reconstruction(rig, records)
+    return break_down(found, (), locate_force(found.without(faulty)))
 
 
 def placed_by(rig, records):
-    return locate_force(evidence(rig, records))
+    return locate_force(reconstruction(rig, records))
 
 
 def test_a_tone_on_one_sensor_late_in_one_record(rig, measured):
@@ -106,15 +106,15 @@ def at_rates(rig, real, sample_times, quantities):
 def test_records_of_different_sample_rates_place_a_force_together(rig, sample_times):
     quantities = ("force", *(sensor.quantity for sensor in rig.sensors))
     real = replace(rig, elements=(CubicSpring(1.37, 3000.0),))
-    seen = evidence(rig, list(at_rates(rig, real, sample_times, quantities)))
+    seen = reconstruction(rig, list(at_rates(rig, real, sample_times, quantities)))
     found, there = locate_force(seen), seen.place(1.37)
     assert abs(found.at - 1.37) < min(0.01 * rig.modes.length, 4.0 * found.at_std) and found.is_single_force
     assert there.strength_along(there.displacement**3) == pytest.approx(3000.0, rel=0.2)
     slower = replace(seen.data.records[0], sample_time=(1.0 + 1e-8) * sample_times[0])
-    assert evidence(rig, [*seen.data.records, slower]).sample_times == (*sample_times, sample_times[0])
+    assert reconstruction(rig, [*seen.data.records, slower]).sample_times == (*sample_times, sample_times[0])
     shaken = replace(rig, elements=(PeriodicForce(1.37, 1.3, 0.05, 0.3),))
     start, *_ = kind_named("periodic_disturbance").starts(
-        evidence(rig, list(at_rates(rig, shaken, sample_times, quantities))), None
+        reconstruction(rig, list(at_rates(rig, shaken, sample_times, quantities))), None
     )
     assert start["frequency"] == pytest.approx(1.3, rel=0.01) and start["amplitude"] == pytest.approx(0.05, rel=0.2)
 
@@ -174,7 +174,7 @@ def test_a_long_record_is_placed_by_some_of_its_lines(rig, measured, monkeypatch
 
 def test_a_force_far_above_the_noise_has_all_of_its_lines(rig, measured):
     record = measured(replace(rig, elements=(CubicSpring(0.7, 1e5),)), "loud", 3.0, 0)
-    found = evidence(rig, (record,))
+    found = reconstruction(rig, (record,))
     (lines,) = lines_of(rig, found.model, found.residuals, DT)
     share = replace(lines, left=1e9 * lines.left).force_share(rig.modes.phi_at(0.7))
     assert share.max() == pytest.approx(1.0) and (share >= 0).all()

@@ -11,9 +11,9 @@ import numpy as np
 from workbench.gap.effects.effect import (
     ALL,
     Effect,
-    Evidence,
     Kind,
     Parameter,
+    Reconstruction,
     Scales,
     place_of,
     place_parameters,
@@ -23,15 +23,15 @@ from workbench.records.record import QUANTITIES
 from workbench.rig.actuators import linear_actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import linear_sensor
-from workbench.rig.simulate import predict
-from workbench.structure.domain import Interval, NamedPoints, Where, centred_at, reach
+from workbench.rig.simulate import simulate_record
+from workbench.structure.domain import Interval, Location, NamedPoints, centred_at, reach
 
 SENSOR_UNIT = "unit of the sensor"
 # of a residual's mean square: cross-talk is tried where another channel explains more of it
 LEAST_CROSSTALK = 0.05
 # of a command's mean square: cross-talk from another that differs by less from a multiple of it is a gain
 LEAST_OWN = 0.01
-Starts = Callable[[Evidence, Any], Iterable[dict[str, Any]]]
+Starts = Callable[[Reconstruction, Any], Iterable[dict[str, Any]]]
 
 SLOW_ENTRY = 0.1  # of the rms step between samples: a reading that reaches its top in a larger step is cut off there
 # stay at the top, in units of the time to stop at the deceleration before it: three times as long as up and back
@@ -72,8 +72,8 @@ def _change_sensors(rig: Rig, target: str, **changes: Any) -> Rig:
 
 def _with_gain(rig: Rig, side: str, target: str, gain: float) -> Rig:
     """The rig with the gain of one actuator or sensor multiplied: nominal errors may have changed it already."""
-    ports: Any = tuple(replace(p, gain=gain * p.gain) if p.name == target else p for p in getattr(rig, side))
-    return replace(rig, **{side: ports})
+    transducers: Any = tuple(replace(p, gain=gain * p.gain) if p.name == target else p for p in getattr(rig, side))
+    return replace(rig, **{side: transducers})
 
 
 def _swapped(rig: Rig, side: str, pair: tuple[str, str]) -> Rig:
@@ -81,14 +81,14 @@ def _swapped(rig: Rig, side: str, pair: tuple[str, str]) -> Rig:
 
     It also keeps the commands of other channels that it takes a share of.
     """
-    by_name = {port.name: port for port in getattr(rig, side)}
+    by_name = {transducer.name: transducer for transducer in getattr(rig, side)}
     exchanged = {pair[0]: by_name[pair[1]], pair[1]: by_name[pair[0]]}
     kept = ("name", "noise_std", "step") if side == "sensors" else ("name", "crosstalk")
-    ports: Any = tuple(
-        replace(exchanged.get(name, port), **{field: getattr(port, field) for field in kept})
-        for name, port in by_name.items()
+    transducers: Any = tuple(
+        replace(exchanged.get(name, transducer), **{field: getattr(transducer, field) for field in kept})
+        for name, transducer in by_name.items()
     )
-    return replace(rig, **{side: ports})
+    return replace(rig, **{side: transducers})
 
 
 def exchanged_last(effects: Sequence[Effect]) -> tuple[Effect, ...]:
@@ -113,12 +113,12 @@ def exchanged_last(effects: Sequence[Effect]) -> tuple[Effect, ...]:
     return tuple(ordered)
 
 
-def _commands(evidence: Evidence, target: str, *, changes: bool = False) -> np.ndarray:
+def _commands(reconstruction: Reconstruction, target: str, *, changes: bool = False) -> np.ndarray:
     """Magnitudes (n,) of all non-zero commands to the target in all records, or of their changes between samples."""
-    names = each_actuator(evidence.rig) if target == ALL else (target,)
+    names = each_actuator(reconstruction.rig) if target == ALL else (target,)
     rows = [
         np.diff(row) if changes else row
-        for record in evidence.data.records
+        for record in reconstruction.data.records
         for channel, row in zip(record.input_channels, record.inputs, strict=True)
         if channel.name in names
     ]
@@ -130,10 +130,10 @@ def _commands(evidence: Evidence, target: str, *, changes: bool = False) -> np.n
 def _quantiles(name: str, *shares: float, of_rates: bool = False) -> Starts:
     """Starts at quantiles of the command, or of its rate of change."""
 
-    def starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
-        values = _commands(evidence, target, changes=of_rates)
+    def starts(reconstruction: Reconstruction, target: str) -> list[dict[str, float]]:
+        values = _commands(reconstruction, target, changes=of_rates)
         if of_rates:
-            values = values / evidence.data.records[0].sample_time
+            values = values / reconstruction.data.records[0].sample_time
         return [{name: float(q)} for q in np.quantile(values, shares)]
 
     return starts
@@ -141,7 +141,7 @@ def _quantiles(name: str, *shares: float, of_rates: bool = False) -> Starts:
 
 def _in_samples(name: str, *times: float) -> Starts:
     """Starts at times in samples."""
-    return lambda evidence, _: [{name: n * evidence.data.records[0].sample_time} for n in times]
+    return lambda reconstruction, _: [{name: n * reconstruction.data.records[0].sample_time} for n in times]
 
 
 def _time_scale(rig: Rig) -> float:
@@ -227,7 +227,7 @@ ACTUATOR_GAIN = _actuator(
     low=-20.0,
     high=20.0,
     log=False,
-    starts=lambda evidence, _: [{"gain": 0.9}],
+    starts=lambda reconstruction, _: [{"gain": 0.9}],
     signed=True,
 )
 
@@ -295,7 +295,9 @@ ACTUATOR_BIAS = Kind(
         ),
     ),
     apply=lambda rig, target, v: _change_actuators(rig, target, bias=v["force"]),
-    starts=lambda evidence, target: [{"force": 0.1 * float(np.sqrt(np.mean(_commands(evidence, target) ** 2)))}],
+    starts=lambda reconstruction, target: [
+        {"force": 0.1 * float(np.sqrt(np.mean(_commands(reconstruction, target) ** 2)))}
+    ],
     targets=each_actuator,
     signed=True,
     phrase="a constant force of an actuator",
@@ -316,8 +318,8 @@ ACTUATOR_RATE_LIMIT = _actuator(
 )
 
 
-def _hysteresis_starts(evidence: Evidence, target: str) -> Iterator[dict[str, float]]:
-    for width in np.quantile(_commands(evidence, target), (0.2, 0.5, 0.8)):
+def _hysteresis_starts(reconstruction: Reconstruction, target: str) -> Iterator[dict[str, float]]:
+    for width in np.quantile(_commands(reconstruction, target), (0.2, 0.5, 0.8)):
         for share in (0.1, 0.4):
             yield {"share": share, "width": float(width)}
 
@@ -346,20 +348,20 @@ SWAPPED_INPUTS = Kind(
     path="actuator",
     parameters=lambda rig, _: (),
     apply=lambda rig, pair, _: _swapped(rig, "actuators", pair),
-    starts=lambda evidence, _: [{}],
+    starts=lambda reconstruction, _: [{}],
     targets=lambda rig: tuple(combinations(each_input(rig), 2)),
     phrase="an exchange of two inputs",
 )
 
 
-def _responses_to_share(evidence: Evidence, pair: tuple[str, str]) -> list[np.ndarray]:
+def _responses_to_share(reconstruction: Reconstruction, pair: tuple[str, str]) -> list[np.ndarray]:
     """Readings (n_sensors, n_samples) of each record per share of the second input's command in the first.
 
     Laws at points and limits of the channels are left out.
     """
     found = []
-    for record, residual in zip(evidence.data.records, evidence.residuals, strict=True):
-        rig = evidence.rig.in_record(record.name)
+    for record, residual in zip(reconstruction.data.records, reconstruction.residuals, strict=True):
+        rig = reconstruction.rig.in_record(record.name)
         linear = replace(
             rig,
             actuators=tuple(linear_actuator(a) for a in rig.actuators),
@@ -370,24 +372,24 @@ def _responses_to_share(evidence: Evidence, pair: tuple[str, str]) -> list[np.nd
         to, source = (each_input(rig).index(name) for name in pair)
         inputs = np.zeros_like(record.inputs)
         inputs[to] = record.inputs[source]
-        found.append(predict(linear, replace(record, inputs=inputs))[:, -residual.shape[1] :])
+        found.append(simulate_record(linear, replace(record, inputs=inputs))[:, -residual.shape[1] :])
     return found
 
 
-def _actuator_crosstalk_starts(evidence: Evidence, pair: tuple[str, str]) -> list[dict[str, float]]:
+def _actuator_crosstalk_starts(reconstruction: Reconstruction, pair: tuple[str, str]) -> list[dict[str, float]]:
     """Share of the second input's command, acting where the first does, if that explains enough of the residuals.
 
     None where the commands are proportional: cross-talk is then a gain.
     """
-    rows = [each_input(evidence.rig).index(name) for name in pair]
-    own, source = np.concatenate([record.inputs[rows] for record in evidence.data.records], axis=1)
+    rows = [each_input(reconstruction.rig).index(name) for name in pair]
+    own, source = np.concatenate([record.inputs[rows] for record in reconstruction.data.records], axis=1)
     size = float(own @ own)
     alike = float(own @ source) ** 2 > (1.0 - LEAST_OWN) * size * float(source @ source)
     if not source.any() or (size > 0 and alike):
         return []
-    noise = np.array(list(_noise(evidence.rig).values()))[:, None]
-    change = np.concatenate([(y / noise).ravel() for y in _responses_to_share(evidence, pair)])
-    residual = np.concatenate([(y / noise).ravel() for y in evidence.residuals])
+    noise = np.array(list(_noise(reconstruction.rig).values()))[:, None]
+    change = np.concatenate([(y / noise).ravel() for y in _responses_to_share(reconstruction, pair)])
+    residual = np.concatenate([(y / noise).ravel() for y in reconstruction.residuals])
     power = float(change @ change)
     share = float(residual @ change) / power if power > 0 else 0.0
     return [{"share": share}] if share**2 * power > LEAST_CROSSTALK * float(residual @ residual) else []
@@ -418,8 +420,8 @@ ACTUATOR_CROSSTALK = Kind(
 )
 
 
-def _position_starts(evidence: Evidence, _: object) -> list[dict[str, Any]]:
-    domain = evidence.rig.modes.domain
+def _position_starts(reconstruction: Reconstruction, _: object) -> list[dict[str, Any]]:
+    domain = reconstruction.rig.modes.domain
     if isinstance(domain, Interval):
         return [{"at": float(x)} for x in domain.length * np.linspace(0.015, 0.985, 41)]
     return [place_values(where) for where in domain.grid(9)]
@@ -436,7 +438,7 @@ def _movable(targets: Callable[[Rig], tuple[str, ...]]) -> Callable[[Rig], tuple
     return movable
 
 
-def _nominal_place(rig: Rig, target: str) -> Where:
+def _nominal_place(rig: Rig, target: str) -> Location:
     """Place of an actuator in the nominal rig."""
     return next(a.at for a in rig.actuators if a.name == target)
 
@@ -450,9 +452,9 @@ def _actuator_place_parameters(rig: Rig, target: str) -> tuple[Parameter, ...]:
     return tuple(replace(p, low=float(low), high=float(high)) for p, low, high in ends)
 
 
-def _actuator_starts(evidence: Evidence, target: str) -> list[dict[str, Any]]:
-    bounds = {p.name: p for p in _actuator_place_parameters(evidence.rig, target)}
-    starts = _position_starts(evidence, target)
+def _actuator_starts(reconstruction: Reconstruction, target: str) -> list[dict[str, Any]]:
+    bounds = {p.name: p for p in _actuator_place_parameters(reconstruction.rig, target)}
+    starts = _position_starts(reconstruction, target)
     return [v for v in starts if all(p.low <= v[name] <= p.high for name, p in bounds.items())]
 
 
@@ -487,7 +489,7 @@ SENSOR_GAIN = _sensor(
     "gain",
     "",
     "a wrong sensor gain",
-    starts=lambda evidence, _: [{"gain": 0.9}],
+    starts=lambda reconstruction, _: [{"gain": 0.9}],
     apply=lambda rig, target, v: _with_gain(rig, "sensors", target, v["gain"]),
     low=-100.0,
     high=100.0,
@@ -496,10 +498,10 @@ SENSOR_GAIN = _sensor(
 )
 
 
-def _residual(evidence: Evidence, name: str) -> np.ndarray:
+def _residual(reconstruction: Reconstruction, name: str) -> np.ndarray:
     """Residual (n_samples,) of a sensor over all records, joined."""
-    j = each_sensor(evidence.rig).index(name)
-    return np.concatenate([residual[j] for residual in evidence.residuals])
+    j = each_sensor(reconstruction.rig).index(name)
+    return np.concatenate([residual[j] for residual in reconstruction.residuals])
 
 
 SENSOR_BIAS = _sensor(
@@ -507,7 +509,7 @@ SENSOR_BIAS = _sensor(
     "bias",
     SENSOR_UNIT,
     "a sensor bias",
-    starts=lambda evidence, target: [{"bias": float(np.mean(_residual(evidence, target)))}],
+    starts=lambda reconstruction, target: [{"bias": float(np.mean(_residual(reconstruction, target)))}],
     signed=True,
 )
 
@@ -516,7 +518,9 @@ SENSOR_DRIFT = _sensor(
     "drift_over_record",
     SENSOR_UNIT,
     "a sensor drift",
-    starts=lambda evidence, target: [{"drift_over_record": 2.0 * float(np.mean(_residual(evidence, target)))}],
+    starts=lambda reconstruction, target: [
+        {"drift_over_record": 2.0 * float(np.mean(_residual(reconstruction, target)))}
+    ],
     attribute="drift",
     signed=True,
 )
@@ -550,16 +554,16 @@ SENSOR_DELAY = _sensor(
 )
 
 
-def _predicted(evidence: Evidence, name: str) -> np.ndarray:
+def _predicted(reconstruction: Reconstruction, name: str) -> np.ndarray:
     """Prediction (n_samples,) of a sensor's readings over all records, joined."""
-    j = each_sensor(evidence.rig).index(name)
-    records = zip(evidence.data.counted, evidence.residuals, strict=True)
+    j = each_sensor(reconstruction.rig).index(name)
+    records = zip(reconstruction.data.counted, reconstruction.residuals, strict=True)
     return np.concatenate([record.outputs[j] - residual[j] for record, residual in records])
 
 
-def _crosstalk_starts(evidence: Evidence, pair: tuple[str, str]) -> list[dict[str, float]]:
+def _crosstalk_starts(reconstruction: Reconstruction, pair: tuple[str, str]) -> list[dict[str, float]]:
     """Share of the second sensor's prediction in the residual of the first, if that explains enough of it."""
-    residual, source = _residual(evidence, pair[0]), _predicted(evidence, pair[1])
+    residual, source = _residual(reconstruction, pair[0]), _predicted(reconstruction, pair[1])
     size = float(source @ source)
     share = float(residual @ source) / size if size > 0 else 0.0
     return [{"share": share}] if share**2 * size > LEAST_CROSSTALK * float(residual @ residual) else []
@@ -590,14 +594,14 @@ SENSOR_CROSSTALK = Kind(
 )
 
 
-def _swapped_output_starts(evidence: Evidence, pair: tuple[str, str]) -> list[dict[str, float]]:
+def _swapped_output_starts(reconstruction: Reconstruction, pair: tuple[str, str]) -> list[dict[str, float]]:
     """One start if the readings of the two sensors agree better with the predictions of each other; else none."""
-    noise, own, crossed = _noise(evidence.rig), 0.0, 0.0
+    noise, own, crossed = _noise(reconstruction.rig), 0.0, 0.0
     for name, other in (pair, pair[::-1]):
-        residual = _residual(evidence, name)
-        measured = _predicted(evidence, name) + residual
+        residual = _residual(reconstruction, name)
+        measured = _predicted(reconstruction, name) + residual
         own += float(residual @ residual) / noise[name] ** 2
-        crossed += float(np.sum((measured - _predicted(evidence, other)) ** 2)) / noise[name] ** 2
+        crossed += float(np.sum((measured - _predicted(reconstruction, other)) ** 2)) / noise[name] ** 2
     return [{}] if crossed < own else []
 
 
@@ -665,9 +669,9 @@ def step_of(readings: np.ndarray) -> float | None:
 def _read(name: str, measure: Callable[[list[np.ndarray]], float | None]) -> Starts:
     """One start, a parameter that a sensor's readings (n_samples,) of all records show; none if they do not."""
 
-    def starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
-        j = each_sensor(evidence.rig).index(target)
-        value = measure([record.outputs[j] for record in evidence.data.records])
+    def starts(reconstruction: Reconstruction, target: str) -> list[dict[str, float]]:
+        j = each_sensor(reconstruction.rig).index(target)
+        value = measure([record.outputs[j] for record in reconstruction.data.records])
         return [] if value is None else [{name: value}]
 
     return starts

@@ -1,4 +1,4 @@
-"""Measured transfer functions (FRFs), and their impulse responses."""
+"""Measured frequency response functions (FRFs), and their impulse responses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,8 +16,8 @@ from workbench.structure.printed import Printed, counted, place_text
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class TransferFunctions(Printed):
-    """Measured transfer functions, frequency last.
+class FrequencyResponses(Printed):
+    """Measured FRFs, frequency last.
 
     Attributes:
         values: (n_outputs, n_references, n_frequencies) complex, outputs per unit input.
@@ -35,7 +35,7 @@ class TransferFunctions(Printed):
     frequencies_hz: np.ndarray
     output_channels: tuple[Channel, ...]
     references: tuple[str, ...] = ("input",)
-    name: str = "transfer functions"
+    name: str = "FRFs"
     remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -70,8 +70,8 @@ class TransferFunctions(Printed):
 
     only = Renamed("select_outputs")
 
-    def select_outputs(self, outputs: tuple[str, ...]) -> "TransferFunctions":
-        """The transfer functions to some outputs, in that order.
+    def select_outputs(self, outputs: tuple[str, ...]) -> "FrequencyResponses":
+        """The FRFs to some outputs, in that order.
 
         Raises:
             ValueError: an unknown output.
@@ -81,10 +81,10 @@ class TransferFunctions(Printed):
         return replace(self, values=self.values[rows], output_channels=channels)
 
 
-def read_transfer(
+def read_frf(
     path: str | Path, *, positions: Sequence[float], quantity: str, matrix: str = "yspec", sample_rate: str = "freq"
 ) -> Record:
-    """Impulse responses from the transfer functions of a MAT file, one column per point.
+    """Impulse responses from the FRFs of a MAT file, one column per point.
 
     Args:
         path: of the file.
@@ -102,27 +102,27 @@ def read_transfer(
     for name in (matrix, sample_rate):
         if name not in arrays:
             raise RecordFileError(f"{path} holds no array {name!r}; name the right one by `matrix` or `sample_rate`")
-    transfer, rate = arrays[matrix], np.ravel(arrays[sample_rate])
-    if transfer.ndim != 2 or transfer.shape[1] != len(positions) or transfer.dtype.kind not in "fiuc":
+    frf, rate = arrays[matrix], np.ravel(arrays[sample_rate])
+    if frf.ndim != 2 or frf.shape[1] != len(positions) or frf.dtype.kind not in "fiuc":
         raise RecordFileError(
             f"{path}, {matrix}: {len(positions)} positions need (n_frequencies, {len(positions)}) columns; got"
-            f" {transfer.shape}"
+            f" {frf.shape}"
         )
     if rate.size != 1 or rate.dtype.kind not in "fiu" or not 0 < rate[0] < np.inf:
         raise RecordFileError(f"{path}, {sample_rate}: the sample rate is one positive number; got {rate[:3]}")
     channels = tuple(Channel(f"point {i + 1}", quantity, at=float(x)) for i, x in enumerate(positions))
-    return impulse_record(transfer.T, sample_rate_hz=float(rate[0]), channels=channels, name=path.stem)
+    return impulse_record(frf.T, sample_rate_hz=float(rate[0]), channels=channels, name=path.stem)
 
 
 def impulse_record(
-    transfer: ArrayLike, *, sample_rate_hz: float, channels: tuple[Channel, ...], name: str = "impulse responses"
+    frf: ArrayLike, *, sample_rate_hz: float, channels: tuple[Channel, ...], name: str = "impulse responses"
 ) -> Record:
-    """The impulse responses of transfer functions on a grid from zero to half the sample rate.
+    """The impulse responses of FRFs on a grid from zero to half the sample rate.
 
     h = irfft(H) · rate: the response to a unit impulse (N s), in the outputs' unit per N s.
 
     Args:
-        transfer: (n_outputs, n_frequencies) complex, per unit input, first column at 0 Hz, last at Nyquist.
+        frf: (n_outputs, n_frequencies) complex, per unit input, first column at 0 Hz, last at Nyquist.
         sample_rate_hz: of the time signals.
         channels: one per output.
         name: of the record.
@@ -130,20 +130,20 @@ def impulse_record(
     Raises:
         ValueError: shapes that do not fit, or non-finite values (channel and line named).
     """
-    transfer = np.atleast_2d(np.asarray(transfer, complex))
-    if transfer.shape[0] != len(channels) or transfer.shape[1] < 3:
+    frf = np.atleast_2d(np.asarray(frf, complex))
+    if frf.shape[0] != len(channels) or frf.shape[1] < 3:
         raise ValueError(
-            f"transfer functions must have shape ({len(channels)} outputs, n_frequencies); got {transfer.shape}."
+            f"FRFs must have shape ({len(channels)} outputs, n_frequencies); got {frf.shape}."
             " Is frequency the last axis?"
         )
-    for channel, row in zip(channels, transfer, strict=True):
+    for channel, row in zip(channels, frf, strict=True):
         bad = ~np.isfinite(row)
         if bad.any():
             raise ValueError(f"{name}, channel {channel.name!r}: line {int(np.argmax(bad))} is not a number")
-    n_samples = 2 * (transfer.shape[1] - 1)
+    n_samples = 2 * (frf.shape[1] - 1)
     return Record(
         sample_time=1.0 / sample_rate_hz,
-        outputs=np.fft.irfft(transfer, n=n_samples, axis=1) * sample_rate_hz,
+        outputs=np.fft.irfft(frf, n=n_samples, axis=1) * sample_rate_hz,
         output_channels=channels,
         name=name,
     )

@@ -6,10 +6,10 @@ import pytest
 from scipy.io import loadmat
 from scipy.signal import csd, lfilter, welch
 
-from workbench.identification import transfer
+from workbench.identification import frf
+from workbench.identification.frf import coherence_noise, identify_frf
 from workbench.identification.rig_from import rig_from
 from workbench.identification.signal.clocks import far_from_real
-from workbench.identification.transfer import coherence_noise, identify_transfer
 from workbench.records.record import Channel
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
@@ -50,7 +50,7 @@ def test_modes_of_the_band_whatever_lies_beyond(quantity):
     errors = []
     for seed in range(3):
         measured, std = noisy(h, seed)
-        found = identify_transfer(measured, F, channels=channels, noise_std=std)
+        found = identify_frf(measured, F, channels=channels, noise_std=std)
         assert found.modes.n_modes == 3
         assert np.diag(mac(found.modes.shapes, modes.phi(np.array(PLACES))[:, 1:4])).min() > 0.999
         assert np.abs(found.fitted - h).max() < 0.02 * np.abs(h).max()
@@ -70,7 +70,7 @@ def test_noise_that_outputs_share_is_no_mode(seed):
     modes, h, channels = beam("acceleration")
     common, own = (rng.standard_normal((2, n, *h[0, :1].shape)) for n in (1, len(h)))
     noise = np.tensordot([1.0, 1j], np.sqrt(0.9) * common + np.sqrt(0.1) * own, 1)
-    found = identify_transfer(h[:, :1] + 0.02 * np.abs(h[:, :1]).mean() * noise, F, channels=channels)
+    found = identify_frf(h[:, :1] + 0.02 * np.abs(h[:, :1]).mean() * noise, F, channels=channels)
     np.testing.assert_allclose(found.modes.omega, modes.omega[1:4], rtol=2e-3)
     assert (np.abs(found.modes.omega - modes.omega[1:4]) < 4 * found.omega_std).all()
 
@@ -79,7 +79,7 @@ def test_noise_told_in_any_unit_counts_between_lines_alone():
     """Times a thousand it hid every mode."""
     _, h, channels = beam("acceleration")
     measured, std = (each[:, :1, ::4] for each in noisy(h, 0, 0.1))
-    told = [identify_transfer(measured, F[::4], channels=channels, noise_std=k * std) for k in (1e-3, 1.0, 1e3)]
+    told = [identify_frf(measured, F[::4], channels=channels, noise_std=k * std) for k in (1e-3, 1.0, 1e3)]
     assert told[1].modes.n_modes == 3
     for other, k in ((told[0], 1e-3), (told[2], 1e3)):
         assert np.allclose(other.modes.omega, told[1].modes.omega, rtol=1e-10)
@@ -96,7 +96,7 @@ def test_errors_grow_where_what_is_left_is_louder():
         rng = np.random.default_rng(seed)
         std = 0.002 * np.abs(h).mean() * np.where(np.abs(lines - 9.8) < 2.0, 10.0, 1.0)
         measured = h + std * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape))
-        found = identify_transfer(measured, lines, channels=channels, max_modes=4)
+        found = identify_frf(measured, lines, channels=channels, max_modes=4)
         r = int(np.argmin(np.abs(found.modes.omega - modes.omega[2])))
         scores.append((found.modes.omega[r] - modes.omega[2]) / found.omega_std[r])
         scores.append((found.modes.zeta[r] - 0.01) / found.zeta_std[r])
@@ -112,7 +112,7 @@ def test_noise_that_goes_with_the_size_needs_not_be_told():
         rng = np.random.default_rng(seed)
         std = 0.02 * np.abs(h) + 1e-4 * np.abs(h).mean()
         measured = h + std * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape))
-        found = identify_transfer(measured, F[::2], channels=channels)
+        found = identify_frf(measured, F[::2], channels=channels)
         assert found.modes.n_modes == 3
         scores += [(found.modes.omega - modes.omega[1:4]) / found.omega_std, (found.modes.zeta - 0.01) / found.zeta_std]
     assert 0.27 < np.mean(np.square(scores)) < 2.35  # χ² of 18, one chance in a thousand either way
@@ -135,7 +135,7 @@ def test_noise_of_other_references_and_along_frequency_makes_no_mode(how, seed):
     h = h + noise * (rng.normal(size=h.shape) + 1j * rng.normal(size=h.shape)) / np.sqrt(2.0)
     quantity = "displacement" if how == "integrated" else "acceleration"
     h = h / s**2 if how == "integrated" else h
-    found = identify_transfer(h, hz, channels=tuple(Channel(f"p{k}", quantity) for k in range(6)))
+    found = identify_frf(h, hz, channels=tuple(Channel(f"p{k}", quantity) for k in range(6)))
     off = 2.0 * np.pi * found.modes.frequencies_hz - omega[:, 0]
     assert (np.abs(off) < 5.0 * found.omega_std).all()
 
@@ -152,7 +152,7 @@ def test_an_exponential_window_makes_no_modes_and_is_remarked(tau):
     hz = np.fft.rfftfreq(n, 1.0 / rate)
     kept = (hz > 4.0) & (hz < 150.0)
     channels = tuple(Channel(f"p{k}", "acceleration") for k in range(4))
-    found = identify_transfer(np.fft.rfft(y)[:, kept] / rate, hz[kept], channels=channels)
+    found = identify_frf(np.fft.rfft(y)[:, kept] / rate, hz[kept], channels=channels)
     assert found.modes.n_modes == 4
     np.testing.assert_allclose(-found.modes.poles.real, decay + 1.0 / tau, rtol=0.05)
     (remark,) = [remark for remark in found.remarks if "exponential window" in remark]
@@ -171,7 +171,7 @@ def test_many_lines_are_fitted_band_after_band():
     rng = np.random.default_rng(0)
     h = h + 0.01 * np.abs(h).mean() * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape))
     channels = tuple(Channel(s.name, "acceleration", at=s.at) for s in sensors)
-    found = identify_transfer(h, lines, channels=channels)
+    found = identify_frf(h, lines, channels=channels)
     inside = modes.frequencies_hz[(modes.frequencies_hz > 1.0) & (modes.frequencies_hz < 60.0)]
     rings = np.flatnonzero(found.modes.zeta < 0.05)
     assert found.fitted.shape == (4, 1, 1600) and found.frequencies_hz.size == 1600
@@ -207,11 +207,11 @@ def test_a_mode_that_drifts_is_one_mode_with_a_remark(seed, n_outputs):
     channels, seen, seeds = tuple(Channel(f"p{j}", "displacement") for j in range(n_outputs)), [], np.atleast_1d(seed)
     for each in seeds:
         lines, h, omega = drifting(np.random.default_rng(each), 2.0, n_outputs)
-        found = identify_transfer(h, lines, channels=channels)
+        found = identify_frf(h, lines, channels=channels)
         right = found.modes.n_modes == 3 and np.abs(found.modes.omega / omega - 1.0).max() < 2e-3
         seen.append(right and any("peaks of mode 2 (" in remark for remark in found.remarks))
         lines, h, _ = drifting(np.random.default_rng(each), 0.0, n_outputs)
-        still = identify_transfer(h, lines, channels=channels)
+        still = identify_frf(h, lines, channels=channels)
         assert still.modes.n_modes == 3 and not still.scatter_hz.any() and not still.remarks
     assert np.mean(seen) > 0.9
 
@@ -237,7 +237,7 @@ CROWDED_HZ = np.array([39.4, 108.6, 212.9])
 def test_points_that_disagree_make_one_mode_of_a_crowd():
     """Modes that all points share took up the disagreement, by three to five beside each other."""
     lines, h = one_by_one(np.random.default_rng(1))
-    found = identify_transfer(h, lines, channels=tuple(Channel(f"p{j}", "acceleration") for j in range(10)))
+    found = identify_frf(h, lines, channels=tuple(Channel(f"p{j}", "acceleration") for j in range(10)))
     assert found.modes.n_modes == 3
     assert np.abs(found.modes.frequencies_hz / CROWDED_HZ - 1.0).max() < 3e-3
     assert all(found.cluster_hz)
@@ -254,7 +254,7 @@ def test_close_modes_that_damping_couples_are_two():
     h = s**2 * np.einsum("jr,kr->jk", shapes, inner)
     rng = np.random.default_rng(1)
     h = h + 2e-3 * np.abs(h).mean() * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape))
-    found = identify_transfer(h, lines, channels=tuple(Channel(f"p{j}", "acceleration") for j in range(8)))
+    found = identify_frf(h, lines, channels=tuple(Channel(f"p{j}", "acceleration") for j in range(8)))
     poles = np.linalg.eigvals(np.block([[np.zeros((2, 2)), np.eye(2)], [-np.diag(omega**2), -c]]))
     truth = np.sort(np.abs(poles[poles.imag > 0]))
     assert found.modes.n_modes == 2 and not any(found.cluster_hz)
@@ -283,30 +283,30 @@ def test_points_on_a_plate_and_names_of_points_stay_with_the_modes():
     h = h * (1.0 + 1e-4 * np.random.default_rng(0).standard_normal(h.shape))
     for at in (places, ["P1", "P2", "P3"]):
         channels = tuple(Channel(f"y{j}", "displacement", at=place) for j, place in enumerate(at))
-        found = identify_transfer(h, lines, channels=channels)
+        found = identify_frf(h, lines, channels=channels)
         assert listed(found.modes.positions) == at and found.shape_covariance.shape == (2, 3, 3)
         np.testing.assert_allclose(np.diag(mac(found.modes.shapes, shapes)), 1.0, atol=1e-6)
 
 
-def test_what_is_no_transfer_function_is_refused():
+def test_what_is_no_frf_is_refused():
     _, h, channels = beam("displacement")
     with pytest.raises(ValueError, match="Is frequency the last axis"):
-        identify_transfer(h[:, 0].T, F, channels=channels)
+        identify_frf(h[:, 0].T, F, channels=channels)
     with pytest.raises(ValueError, match="0 lines lie between 90 and 95 Hz"):
-        identify_transfer(h, F, channels=channels, band_hz=(90, 95))
+        identify_frf(h, F, channels=channels, band_hz=(90, 95))
     with pytest.raises(ValueError, match="noise_std must be positive"):
-        identify_transfer(h, F, channels=channels, noise_std=np.zeros(h.shape))
+        identify_frf(h, F, channels=channels, noise_std=np.zeros(h.shape))
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not RULER.is_file(), reason=f"the measured ruler is not at {RULER}")
 def test_the_measured_ruler():
     """Frequencies seen by eye; points measured one after another disagree, and no mode more is told for it."""
-    transfer = loadmat(RULER)["yspec"].T
-    lines = np.linspace(0.0, 10_000.0, transfer.shape[1])
+    frf = loadmat(RULER)["yspec"].T
+    lines = np.linspace(0.0, 10_000.0, frf.shape[1])
     places = np.linspace(0.003, 0.983, 10)
     channels = tuple(Channel(f"point {k}", "acceleration", at=float(x)) for k, x in enumerate(places))
-    rings = identify_transfer(transfer, lines, channels=channels, band_hz=(25.0, 800.0)).modes
+    rings = identify_frf(frf, lines, channels=channels, band_hz=(25.0, 800.0)).modes
     seen = np.array([39.4, 108.8, 212.0, 352.6, 517.9, 551.0, 729.0])
     assert rings.n_modes == seen.size
     assert np.abs(rings.frequencies_hz / seen - 1).max() < 0.005
@@ -355,7 +355,7 @@ def test_one_sensor_tells_a_mode_that_changes_after_a_blow_from_two(law, seed):
     """It made two to four modes of the one."""
     hz, channels = [21.0, 57.0, 96.0], (Channel("p", "displacement"),)
     lines, h = struck(np.random.default_rng(seed), hz, LAWS[law])
-    found = identify_transfer(h, lines, channels=channels)
+    found = identify_frf(h, lines, channels=channels)
     assert found.modes.frequencies_hz == pytest.approx(hz, rel=0.025)
     assert (found.scatter_hz > 0).tolist() == [False, True, False]
     assert any("peaks of mode 2 (" in remark for remark in found.remarks)
@@ -365,7 +365,7 @@ def test_one_sensor_tells_a_mode_that_changes_after_a_blow_from_two(law, seed):
 def test_one_sensor_tells_two_close_modes_as_two(apart):
     hz = [21.0, 57.0, 57.0 * (1.0 + apart)]
     lines, h = struck(np.random.default_rng(3), hz, steady)
-    found = identify_transfer(h, lines, channels=(Channel("p", "displacement"),))
+    found = identify_frf(h, lines, channels=(Channel("p", "displacement"),))
     assert found.modes.frequencies_hz == pytest.approx(hz, rel=1e-3)
     assert not found.scatter_hz.any()
 
@@ -382,7 +382,7 @@ def test_noise_that_goes_with_size_hides_no_mode_and_makes_none_change(relative,
     rng = np.random.default_rng(seed)
     noise = rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape)
     channels = tuple(Channel(f"p{j}", "acceleration", at=float(x)) for j, x in enumerate(at))
-    found = identify_transfer(h * (1.0 + relative * noise), lines, channels=channels)
+    found = identify_frf(h * (1.0 + relative * noise), lines, channels=channels)
     assert not found.remarks and found.modes.n_modes == 4
     assert (np.abs(found.modes.omega - omega) < 4.0 * found.omega_std).all()
     assert (np.abs(found.modes.zeta - damping) < 4.0 * found.zeta_std).all()
@@ -405,7 +405,7 @@ def test_outputs_that_a_filter_delays_are_put_in_time(quantity, late):
     h, turn = h[:, :1], np.exp(-2j * np.pi * F * np.array(late)[:, None, None])
     rng = np.random.default_rng(4)
     noise = 1e-3 * np.abs(h).max() * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape))
-    found = identify_transfer(h * turn + noise, F, channels=channels)
+    found = identify_frf(h * turn + noise, F, channels=channels)
     np.testing.assert_allclose(found.delays, late, atol=2e-4)
     np.testing.assert_allclose(found.modes.omega, modes.omega[1:4], rtol=1e-3)
     assert far_from_real(found.modes).max() < 0.02
@@ -422,7 +422,7 @@ def test_phases_that_do_not_grow_with_frequency_are_no_delay():
     pairs = residues[:, :, None] / (s - poles[:, None]) + residues.conj()[:, :, None] / (s - poles.conj()[:, None])
     channels = tuple(Channel(name, "displacement") for name in "ab")
     h = noisy(pairs.sum(axis=1)[:, None], 0)[0]
-    assert not identify_transfer(h, F, channels=channels).delays.any()
+    assert not identify_frf(h, F, channels=channels).delays.any()
 
 
 def test_damping_that_hanns_window_makes_too_high_is_remarked():
@@ -433,7 +433,7 @@ def test_damping_that_hanns_window_makes_too_high_is_remarked():
     f, power = welch(u, rate, nperseg=1024)
     h = np.array([csd(u, y, rate, nperseg=1024)[1] / power for y in [[1.0, 0.25], [0.3, -0.5]] @ np.array(coordinates)])
     inside = (f > 4.0) & (f < 40.0)
-    found = identify_transfer(h[:, inside], f[inside], channels=(Channel("a", "displacement"), Channel("b")))
+    found = identify_frf(h[:, inside], f[inside], channels=(Channel("a", "displacement"), Channel("b")))
     assert (found.modes.zeta > 1.3 * 0.005).all()
     assert any("of modes 1, 2: if these are averages by Hann's window" in remark for remark in found.remarks)
 
@@ -442,7 +442,7 @@ def test_a_band_that_ended_early_is_searched_in_the_time_that_others_leave(monke
     f = np.arange(1.0, 33.0, 0.02)
     s, poles = 2j * np.pi * f, 2.0 * np.pi * np.array([5.0, 15.0, 28.0]) * (-0.01 + 1j)
     h = sum(1.0 / (s - pole) + 1.0 / (s - pole.conjugate()) for pole in poles)[None]
-    rng, searched, selected = np.random.default_rng(0), [], transfer._select_in_band
+    rng, searched, selected = np.random.default_rng(0), [], frf._select_in_band
     h = h + 1e-4 * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape))
 
     def ended_once(lines, options):
@@ -453,8 +453,8 @@ def test_a_band_that_ended_early_is_searched_in_the_time_that_others_leave(monke
             options.time_limit.unfinished["search for further modes"] = 0.1
         return found
 
-    monkeypatch.setattr(transfer, "_select_in_band", ended_once)
-    found = identify_transfer(h, f, channels=(Channel("v", "velocity"),), seconds=60.0)
+    monkeypatch.setattr(frf, "_select_in_band", ended_once)
+    found = identify_frf(h, f, channels=(Channel("v", "velocity"),), seconds=60.0)
     assert [begin for begin, _ in searched] == sorted({begin for begin, _ in searched}) + [searched[0][0]]
     assert searched[-1][1] > 2.0 * searched[0][1]
     assert found.modes.n_modes == 3 and not any("stopped after" in remark for remark in found.remarks)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from workbench.gap.effects.effect import ForceAndMotion
-from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.localisation.force_reconstruction import ForceReconstruction
 from workbench.gap.prediction.residuals import FitData
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import CubicSpring
@@ -29,8 +29,8 @@ def test_pairs_of_points_that_move_alike_do_not_crowd_out_others():
     real = replace(rig, elements=(CubicSpring(Between("a0", "a3"), 300.0),))
     clean = simulate(real, 5.0 * rng.standard_normal((1, 1500)), sample_time=0.01, name="one")
     noisy = replace(clean, outputs=clean.outputs + 0.02 * rng.standard_normal(clean.outputs.shape))
-    evidence = Evidence.of(rig, FitData((noisy,), np.full(5, 0.02)))
-    pairs = [{int(name[1]) for name in where} for where in evidence.peaks if isinstance(where, Between)]
+    reconstruction = ForceReconstruction.of(rig, FitData((noisy,), np.full(5, 0.02)))
+    pairs = [{int(name[1]) for name in where} for where in reconstruction.peaks if isinstance(where, Between)]
     assert {0, 3} in pairs
     assert len({frozenset(pair) for pair in pairs}) == len(pairs) == 10  # every two floors once
 

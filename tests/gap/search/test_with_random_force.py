@@ -10,14 +10,14 @@ from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Effect
 from workbench.gap.effects.nominal import nominal_errors
-from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.localisation.force_reconstruction import ForceReconstruction
 from workbench.gap.prediction.innovations import Observer
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
-from workbench.gap.search.beside_random import looks_random, random_with_effects, random_with_nominal_errors
 from workbench.gap.search.fit import Fit
 from workbench.gap.search.jointly import evaluated
 from workbench.gap.search.search import Search
+from workbench.gap.search.with_random_force import looks_random, random_with_effects, random_with_nominal_errors
 from workbench.records.resample import decimate
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import AirDrag, CoulombFriction, OneSidedStop
@@ -48,29 +48,29 @@ def records(rig, record_of):
     return make
 
 
-def evidence(rig, records):
-    return Evidence.of(rig, FitData(tuple(records), np.array([s.noise_std for s in rig.sensors])))
+def reconstruction(rig, records):
+    return ForceReconstruction.of(rig, FitData(tuple(records), np.array([s.noise_std for s in rig.sensors])))
 
 
 def test_only_what_keeps_its_level_looks_random(rig, records):
     told = replace(rig, actuators=rig.actuators[:1])
-    assert looks_random(evidence(told, records(rig, 0.05)))
+    assert looks_random(reconstruction(told, records(rig, 0.05)))
     gripped = replace(rig, elements=(CoulombFriction(1.3, 0.05, 1e-3),))
-    assert not looks_random(evidence(told, records(gripped, 0.0)))
+    assert not looks_random(reconstruction(told, records(gripped, 0.0)))
     stiffer = kind_named("modulus_error").apply(rig, None, {"factor": 1.05})
-    assert not looks_random(evidence(told, records(stiffer, 0.0)))
+    assert not looks_random(reconstruction(told, records(stiffer, 0.0)))
 
 
 def test_no_random_force_is_sought_over_several_sample_rates(rig, records):
     told = replace(rig, actuators=rig.actuators[:1])
     *others, last = records(rig, 0.05)
-    assert looks_random(evidence(told, others))
-    assert not looks_random(evidence(told, [*others, decimate(last, 2)]))
+    assert looks_random(reconstruction(told, others))
+    assert not looks_random(reconstruction(told, [*others, decimate(last, 2)]))
 
 
 def test_what_drifts_far_below_the_first_mode_is_not_the_forces_level(rig, records):
     # accelerometers hardly see it: what an estimate of the force does there is chance
-    seen = evidence(replace(rig, actuators=rig.actuators[:1]), records(rig, 0.05))
+    seen = reconstruction(replace(rig, actuators=rig.actuators[:1]), records(rig, 0.05))
     (place, *_), n = seen.at_peaks, seen.data.counted[0].n_samples
     slow = np.sin(2.0 * np.pi * np.arange(n) / n)
     drifting = replace(place, force=place.force + np.concatenate([0.0 * slow, 0.2 * slow, 0.1 * slow]))
@@ -102,7 +102,7 @@ def test_it_is_found_beside_small_errors_of_the_model(rig, records):
     nominal = data.by_channel(data.residual(told))
     search = Search(told, data, data, data, CATALOGUE, lambda text, share: None, ALONE, nominal)
     step = evaluated(search, Fit((nominal_errors(told, search.prior),), 0.0, nominal, 0))
-    assert not looks_random(evidence(told, made))
+    assert not looks_random(reconstruction(told, made))
     assert random_with_nominal_errors(search, step) is None
     found = random_with_nominal_errors(search, step, surely=False)
     wind = found.best.effects[-1]

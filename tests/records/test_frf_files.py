@@ -5,18 +5,18 @@ import pyuff
 from scipy.io import savemat
 
 from workbench.records.files import read_measured, read_record
+from workbench.records.frequency_responses import impulse_record, read_frf
 from workbench.records.limits import RecordFileError
 from workbench.records.record import Channel, Record
 from workbench.records.resample import decimate
-from workbench.records.transfer_functions import impulse_record, read_transfer
 
 
-def test_transfer_function_of_an_oscillator_is_its_impulse_response():
+def test_frf_of_an_oscillator_is_its_impulse_response():
     """1 / (k - m ω² + i c ω) against sin(ω_d t) e^{-σt} / (m ω_d), away from the first samples (the band ends)."""
     mass, omega, zeta, rate, n = 2.0, 40.0, 0.02, 1000.0, 8192
     w = 2 * np.pi * np.fft.rfftfreq(n, 1 / rate)
-    transfer = 1.0 / (mass * (omega**2 - w**2 + 2j * zeta * omega * w))
-    record = impulse_record(transfer, sample_rate_hz=rate, channels=(Channel("x", "displacement"),))
+    frf = 1.0 / (mass * (omega**2 - w**2 + 2j * zeta * omega * w))
+    record = impulse_record(frf, sample_rate_hz=rate, channels=(Channel("x", "displacement"),))
     time = record.time
     omega_d = omega * np.sqrt(1 - zeta**2)
     exact = np.exp(-zeta * omega * time) * np.sin(omega_d * time) / (mass * omega_d)
@@ -51,21 +51,21 @@ def test_decimation_keeps_the_hold_of_inputs_and_refuses_a_factor_below_one():
             decimate(record, factor)
 
 
-def test_read_transfer(tmp_path):
+def test_read_frf(tmp_path):
     path = tmp_path / "frf.mat"
     savemat(path, {"yspec": np.ones((9, 2), complex), "freq": 100})
-    record = read_transfer(path, positions=[0.0, 1.0], quantity="acceleration")
+    record = read_frf(path, positions=[0.0, 1.0], quantity="acceleration")
     assert record.n_samples == 16
     assert record.positions.tolist() == [0.0, 1.0]
     with pytest.raises(RecordFileError, match="3 positions need"):
-        read_transfer(path, positions=[0, 1, 2], quantity="acceleration")
+        read_frf(path, positions=[0, 1, 2], quantity="acceleration")
     with pytest.raises(RecordFileError, match="holds no array 'frf'"):
-        read_transfer(path, positions=[0, 1], quantity="acceleration", matrix="frf")
+        read_frf(path, positions=[0, 1], quantity="acceleration", matrix="frf")
     with pytest.raises(RecordFileError, match="no such file"):
-        read_transfer(tmp_path / "none.mat", positions=[0], quantity="acceleration")
+        read_frf(tmp_path / "none.mat", positions=[0], quantity="acceleration")
     (tmp_path / "bad.mat").write_bytes(b"not a mat file")
     with pytest.raises(RecordFileError, match="cannot be read"):
-        read_transfer(tmp_path / "bad.mat", positions=[0], quantity="acceleration")
+        read_frf(tmp_path / "bad.mat", positions=[0], quantity="acceleration")
 
 
 LINES = np.linspace(1.0, 40.0, 50)
@@ -93,7 +93,7 @@ def save(path, arrays):
         ({"omega": 2 * np.pi * LINES, "a": SPECTRA[0, 0], "b": SPECTRA[1, 0]}, SPECTRA[:2, :1], ("a", "b")),
     ],
 )
-def test_arrays_of_transfer_functions_are_read_whichever_way_they_lie(tmp_path, ending, arrays, values, names):
+def test_arrays_of_frfs_are_read_whichever_way_they_lie(tmp_path, ending, arrays, values, names):
     found = read_measured(save(tmp_path / f"x{ending}", arrays))
     np.testing.assert_allclose(found.values, values, rtol=1e-15)
     np.testing.assert_allclose(found.frequencies_hz, LINES, rtol=1e-14)
@@ -164,7 +164,7 @@ def test_lines_by_another_name_are_not_passed_over_for_a_sample_rate(tmp_path):
         ({"f": LINES, "H": SPECTRA, "positions": [0.0, 1.0]}, "2 places of 3 points"),
     ],
 )
-def test_transfer_functions_that_cannot_be_read_as_meant_are_refused(tmp_path, arrays, match):
+def test_frfs_that_cannot_be_read_as_meant_are_refused(tmp_path, arrays, match):
     with pytest.raises(RecordFileError, match=match):
         read_measured(save(tmp_path / "x.npz", arrays))
 
@@ -177,7 +177,7 @@ def test_a_table_of_real_and_imaginary_parts(tmp_path):
     found = read_measured(path)
     np.testing.assert_allclose(found.values, SPECTRA[:2, :1], rtol=1e-15)
     assert found.output_names == ("tip", "root")
-    with pytest.raises(RecordFileError, match=r"transfer functions.*identify_transfer"):
+    with pytest.raises(RecordFileError, match=r"FRFs.*identify_frf"):
         read_record(path)
 
 
@@ -277,14 +277,14 @@ def save_58(path, pairs, function=4, lines=LINES, unit="NONE"):
     return path
 
 
-def test_universal_files_of_transfer_functions(tmp_path):
+def test_universal_files_of_frfs(tmp_path):
     pairs = [(j + 1, i + 7, SPECTRA[j, i]) for j in range(3) for i in range(2)]
     found = read_measured(save_58(tmp_path / "x.uff", pairs))
     np.testing.assert_allclose(found.values, SPECTRA, rtol=1e-6)
     np.testing.assert_allclose(found.frequencies_hz, LINES, rtol=1e-6)
     assert [c.quantity for c in found.output_channels] == ["acceleration"] * 3
     assert found.references == ("node 7 direction 3", "node 8 direction 3")
-    with pytest.raises(RecordFileError, match="lacks the transfer function from node 8 direction 3 to node 3"):
+    with pytest.raises(RecordFileError, match="lacks the FRF from node 8 direction 3 to node 3"):
         read_measured(save_58(tmp_path / "less.uff", pairs[:-1]))
     with pytest.raises(RecordFileError, match="complex"):
         read_measured(save_58(tmp_path / "other.uff", pairs[:1], function=9))

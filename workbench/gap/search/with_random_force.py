@@ -10,7 +10,7 @@ from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, names_in, place_values
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.effects.nominal import NominalPrior
-from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.localisation.force_reconstruction import ForceReconstruction
 from workbench.gap.prediction.innovations import Observer
 from workbench.gap.prediction.random_force import TONAL, RandomForceFit, fit_random_force, followed, model_filter, tonal
 from workbench.gap.search.finish import finished, plainest, ranked, simplest
@@ -45,24 +45,24 @@ class WithRandom(NamedTuple):
         return search.near(self.fit, RANDOM.near) and not self.random.tonal > TONAL
 
 
-def looks_random(evidence: Evidence) -> bool:
+def looks_random(reconstruction: ForceReconstruction) -> bool:
     """Whether the unmodelled force is equally strong in every record, unrelated to inputs and motion, and no tone.
 
     False for records of several sample rates: the force varies within a sample, so it has another strength at each.
     """
-    if evidence.has_several_rates:
+    if reconstruction.has_several_rates:
         return False
-    records, place = evidence.data.counted, evidence.at_peaks[0]
+    records, place = reconstruction.data.counted, reconstruction.at_peaks[0]
     forces = np.split(place.force, np.cumsum([record.n_samples for record in records])[:-1])
-    elastic = evidence.rig.modes.omega[evidence.rig.modes.omega > 0] / (2.0 * np.pi)
+    elastic = reconstruction.rig.modes.omega[reconstruction.rig.modes.omega > 0] / (2.0 * np.pi)
     slowest = RANDOM.drifting * float(elastic[0]) if elastic.size else 0.0
     levels = np.array([_rms_above(slowest, force, records[0].sample_time) for force in forces])
     if len(forces) < 2 or np.ptp(levels) > RANDOM.spread * levels.mean():
         return False
     if min(tonal(force, records[0].sample_time) for force in forces) > TONAL:
         return False
-    shape = evidence.rig.modes.phi_at(place.at)
-    motions = [shape @ np.array([motion.displacement, motion.velocity]) for motion in evidence.motions]
+    shape = reconstruction.rig.modes.phi_at(place.at)
+    motions = [shape @ np.array([motion.displacement, motion.velocity]) for motion in reconstruction.motions]
     each = zip(forces, records, motions, strict=True)
     return max(followed(force, record.inputs, motion) for force, record, motion in each) < RANDOM.follows
 
@@ -74,29 +74,29 @@ def _rms_above(frequency: float, force: Floats, sample_time: float) -> float:
     return float(np.sqrt(np.mean(np.fft.irfft(spectrum, force.size) ** 2)))
 
 
-def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | None, list[Fit]]:
+def decide_on_random(search: Search, reconstruction: ForceReconstruction) -> tuple[Decision | None, list[Fit]]:
     """The decision for a random disturbance, alone or with a few effects, and all fits that were tried.
 
     The decision is None if the whitened residual is never white, or if effects explain the records without a random
     disturbance, which over-fits easily.
     """
-    search, evidence = _without_clipped(search, (), evidence)
-    evidence = _with_laws_on_measured_motion(search, evidence)
-    if not looks_random(evidence):
+    search, reconstruction = _without_clipped(search, (), reconstruction)
+    reconstruction = _with_laws_on_measured_motion(search, reconstruction)
+    if not looks_random(reconstruction):
         return None, []
-    alone = _fitted_with_random(search, search.without_effects(), evidence)
+    alone = _fitted_with_random(search, search.without_effects(), reconstruction)
     if not alone.is_near(search):
         return None, []
     tried = [alone]
     for _ in range(RANDOM.beside):
-        with_one_more = _with_one_more(search, tried[-1], evidence)
+        with_one_more = _with_one_more(search, tried[-1], reconstruction)
         if with_one_more is None:
             return None, []
         tried += with_one_more
         found = _best_decision(search, tried)
         if found is not None or not with_one_more or search.is_over:
             break
-        evidence = _evidence_with(search, tried[-1].given)
+        reconstruction = _reconstruction_with(search, tried[-1].given)
     return found, [each.fit for each in tried]
 
 
@@ -107,11 +107,11 @@ def random_with_effects(search: Search, found: Sequence[Fit]) -> Decision | None
     """
     tried, searches = [], []
     for given in best_of_each_kind(found)[: RANDOM.likeliest_sets]:
-        unclipped, evidence = _without_clipped(search, given.effects, search.evidence_with(given.effects))
-        evidence = _with_laws_on_measured_motion(unclipped, evidence)
-        if looks_random(evidence):
-            by_channel = unclipped.data.by_channel(unclipped.data.residual(evidence.rig))
-            tried.append(_fitted_with_random(unclipped, replace(given, cost_by_channel=by_channel), evidence))
+        unclipped, reconstruction = _without_clipped(search, given.effects, search.reconstruction_with(given.effects))
+        reconstruction = _with_laws_on_measured_motion(unclipped, reconstruction)
+        if looks_random(reconstruction):
+            by_channel = unclipped.data.by_channel(unclipped.data.residual(reconstruction.rig))
+            tried.append(_fitted_with_random(unclipped, replace(given, cost_by_channel=by_channel), reconstruction))
             searches.append(unclipped)
     decision = _best_decision(search, tried)
     if decision is not None or not tried or search.is_over:
@@ -119,21 +119,21 @@ def random_with_effects(search: Search, found: Sequence[Fit]) -> Decision | None
     best, unclipped = min(zip(tried, searches, strict=True), key=lambda each: each[0].random.cost)
     if not best.is_near(search):
         return None
-    evidence = _evidence_with(unclipped, best.given)
-    return _best_decision(search, _with_one_more(unclipped, best, evidence) or [])
+    reconstruction = _reconstruction_with(unclipped, best.given)
+    return _best_decision(search, _with_one_more(unclipped, best, reconstruction) or [])
 
 
-def _with_one_more(search: Search, best: WithRandom, evidence: Evidence) -> list[WithRandom] | None:
+def _with_one_more(search: Search, best: WithRandom, reconstruction: ForceReconstruction) -> list[WithRandom] | None:
     """Fits of one effect more with a random force, highest cost first; None if one explains the records without it.
 
     Args:
         best: effects and a random force, whose whitened residual is not white.
-        evidence: of the rig with these effects.
+        reconstruction: of the rig with these effects.
     """
     search.progress("effects with a random disturbance", 0.2)
-    whitener = model_filter(evidence.model, evidence.rig, best.random)
-    whitened = search.through(whitener, _observer(search, evidence.rig, best.random))
-    gaining = whitened.in_parallel(simplest, _improving(search, whitened, best.given, evidence)[: RANDOM.tried])
+    whitener = model_filter(reconstruction.model, reconstruction.rig, best.random)
+    whitened = search.through(whitener, _observer(search, reconstruction.rig, best.random))
+    gaining = whitened.in_parallel(simplest, _improving(search, whitened, best.given, reconstruction)[: RANDOM.tried])
     if any(search.explains(finished(search, candidate)) for candidate in gaining):
         return None
     found = [_fitted_with_random(search, candidate) for candidate in gaining]
@@ -150,32 +150,34 @@ def random_with_nominal_errors(search: Search, step: JointFit, *, surely: bool =
         step: effects and nominal errors to start from, fitted without the force.
         surely: require that the force at the start looks random already.
     """
-    evidence = _evidence_with(search, step.fit.effects)
-    if surely and not looks_random(evidence):
+    reconstruction = _reconstruction_with(search, step.fit.effects)
+    if surely and not looks_random(reconstruction):
         return None
-    found, random = _random_given(search, step.fit, evidence)
+    found, random = _random_given(search, step.fit, reconstruction)
     for _ in range(RANDOM.turns):
         before = random.cost
-        whitener = model_filter(evidence.model, evidence.rig, random)
+        whitener = model_filter(reconstruction.model, reconstruction.rig, random)
         whitened = search.through(whitener, _observer(search, search.rig, random))
         step = fit_jointly(whitened, step.effects, step.errors)
-        evidence = _evidence_with(search, step.fit.effects)
-        found, random = _random_given(search, step.fit, evidence)
+        reconstruction = _reconstruction_with(search, step.fit.effects)
+        found, random = _random_given(search, step.fit, reconstruction)
         if random.cost > (1.0 - RANDOM.settled) * before:
             break
     cost = cost_of(search.rig, step.fit.effects, search.data)
     is_closed = random.left - 1.0 < STEPWISE.explained * cost
     is_noticeable = cost - 1.0 > SEARCH.negligible * float(search.nominal.mean())
-    holds = is_closed and is_noticeable and random.is_steady and looks_random(evidence)
+    holds = is_closed and is_noticeable and random.is_steady and looks_random(reconstruction)
     return Decision("explained", found, random) if holds else None
 
 
-def _evidence_with(search: Search, effects: Sequence[Effect]) -> Evidence:
-    """Evidence of the rig with the given effects, nonlinear laws acting on the measured motion."""
-    return _with_laws_on_measured_motion(search, search.evidence_with(effects))
+def _reconstruction_with(search: Search, effects: Sequence[Effect]) -> ForceReconstruction:
+    """The force reconstructed with the given effects, nonlinear laws acting on the measured motion."""
+    return _with_laws_on_measured_motion(search, search.reconstruction_with(effects))
 
 
-def _improving(search: Search, whitened: Search, given: tuple[Effect, ...], evidence: Evidence) -> list[Fit]:
+def _improving(
+    search: Search, whitened: Search, given: tuple[Effect, ...], reconstruction: ForceReconstruction
+) -> list[Fit]:
     """Fits of the given effects and one more that improve on the random force beside the given ones, best first.
 
     The unmodelled force is located where the random one acts, so all laws are tried again at the best effect's place.
@@ -183,18 +185,18 @@ def _improving(search: Search, whitened: Search, given: tuple[Effect, ...], evid
     Args:
         search: without the whitening filter of the force.
         whitened: the search with it.
-        evidence: of the rig with the given effects.
+        reconstruction: of the rig with the given effects.
     """
     cost, n_given = cost_of(whitened.rig, given, whitened.data), len(parameters_of(search.rig, given))
 
-    def fitted(evidence: Evidence) -> list[Fit]:
-        fits = on_whole_records(whitened, one_more(whitened, given, evidence), RANDOM.finalists)
+    def fitted(reconstruction: ForceReconstruction) -> list[Fit]:
+        fits = on_whole_records(whitened, one_more(whitened, given, reconstruction), RANDOM.finalists)
         return [f for f in fits if whitened.surely_better(f, cost, f.n_parameters - n_given)]
 
-    found = fitted(evidence)
+    found = fitted(reconstruction)
     places = [f.effects[-1].at for f in found if f.effects[-1].at is not None]
     if places:
-        found = sorted((*found, *fitted(evidence.of_force_at(places[0]))), key=lambda f: f.cost)
+        found = sorted((*found, *fitted(reconstruction.of_force_at(places[0]))), key=lambda f: f.cost)
     alternatives = [f for f in best_of_each_kind(found) if f.cost < found[0].cost + RANDOM.alternative]
     # small errors of gains and places remove a little of what the given effects leave
     before = cost_of(search.rig, given, search.data)
@@ -203,13 +205,15 @@ def _improving(search: Search, whitened: Search, given: tuple[Effect, ...], evid
     ]
 
 
-def _without_clipped(search: Search, effects: Sequence[Effect], evidence: Evidence) -> tuple[Search, Evidence]:
-    """The search and its evidence without the sensors that clip, unless an effect is at one of them."""
+def _without_clipped(
+    search: Search, effects: Sequence[Effect], reconstruction: ForceReconstruction
+) -> tuple[Search, ForceReconstruction]:
+    """The search and its reconstruction without the sensors that clip, unless an effect is at one of them."""
     unclipped = search.without_clipped()
     clipped = {sensor.name for sensor in search.rig.sensors} - {sensor.name for sensor in unclipped.rig.sensors}
     if not clipped or any(name in clipped for effect in effects for name in names_in(effect.target)):
-        return search, evidence
-    return unclipped, unclipped.evidence_with(effects)
+        return search, reconstruction
+    return unclipped, unclipped.reconstruction_with(effects)
 
 
 def _best_decision(search: Search, tried: Sequence[WithRandom]) -> Decision | None:
@@ -229,26 +233,26 @@ def _best_decision(search: Search, tried: Sequence[WithRandom]) -> Decision | No
     return Decision("explained", best, next(random for found, random in holding if found is best), alternatives)
 
 
-def _fitted_with_random(search: Search, given: Fit, evidence: Evidence | None = None) -> WithRandom:
+def _fitted_with_random(search: Search, given: Fit, reconstruction: ForceReconstruction | None = None) -> WithRandom:
     """The given effects and a random disturbance, fitted in turns.
 
     Args:
-        evidence: of the rig with the given effects, if available.
+        reconstruction: of the rig with the given effects, if available.
     """
-    if evidence is None:
-        evidence = _evidence_with(search, given.effects)
-    found = _random_given(search, given, evidence)
+    if reconstruction is None:
+        reconstruction = _reconstruction_with(search, given.effects)
+    found = _random_given(search, given, reconstruction)
     for _ in range(RANDOM.turns if given.effects else 0):
         if found.random.holds or not search.near(found.fit, RANDOM.near):
             break
         before = found.random.cost
-        observer = _observer(search, evidence.rig, found.random)
-        data = search.data.through(model_filter(evidence.model, evidence.rig, found.random), observer)
+        observer = _observer(search, reconstruction.rig, found.random)
+        data = search.data.through(model_filter(reconstruction.model, reconstruction.rig, found.random), observer)
         refitted = fit(search.rig, given.effects, data, iterations=8)
-        evidence = search.evidence_with(refitted.effects)
-        given = replace(refitted, cost_by_channel=search.data.by_channel(search.data.residual(evidence.rig)))
-        evidence = _with_laws_on_measured_motion(search, evidence, observer)
-        found = _random_given(search, given, evidence)
+        reconstruction = search.reconstruction_with(refitted.effects)
+        given = replace(refitted, cost_by_channel=search.data.by_channel(search.data.residual(reconstruction.rig)))
+        reconstruction = _with_laws_on_measured_motion(search, reconstruction, observer)
+        found = _random_given(search, given, reconstruction)
         if found.random.cost > (1.0 - RANDOM.settled) * before:
             break
     return found
@@ -261,23 +265,29 @@ def _observer(search: Search, rig: Rig, found: RandomForceFit | None = None) -> 
     return Observer.of(rig, data.noise, data.force_rms, data.sample_times, at=at, rms=force)
 
 
-def _with_laws_on_measured_motion(search: Search, evidence: Evidence, observer: Observer | None = None) -> Evidence:
-    """The evidence with residuals for which nonlinear laws act on the measured motion.
+def _with_laws_on_measured_motion(
+    search: Search, reconstruction: ForceReconstruction, observer: Observer | None = None
+) -> ForceReconstruction:
+    """The reconstruction from residuals for which nonlinear laws act on the measured motion.
 
     Acting on the simulated motion, which lacks the force, they would distort its response.
     """
-    if not is_stepped(evidence.rig):
-        return evidence
-    observer = observer or _observer(search, evidence.rig)
-    return replace(evidence, residuals=tuple(search.data.residual_on_measured_motion(evidence.rig, observer)))
+    if not is_stepped(reconstruction.rig):
+        return reconstruction
+    observer = observer or _observer(search, reconstruction.rig)
+    return replace(
+        reconstruction, residuals=tuple(search.data.residual_on_measured_motion(reconstruction.rig, observer))
+    )
 
 
-def _random_given(search: Search, given: Fit, evidence: Evidence) -> WithRandom:
+def _random_given(search: Search, given: Fit, reconstruction: ForceReconstruction) -> WithRandom:
     """The given effects with a random force fitted to their residual, and the statistics of that force."""
-    domain = evidence.domain
+    domain = reconstruction.domain
     most = RANDOM.points if isinstance(domain, NamedPoints) else RANDOM.starts
-    places = [where for where in evidence.peaks if not isinstance(where, Between)][:most]
-    found = fit_random_force(evidence.rig, search.data, evidence.residuals, places, evidence.data.force_rms)
+    places = [where for where in reconstruction.peaks if not isinstance(where, Between)][:most]
+    found = fit_random_force(
+        reconstruction.rig, search.data, reconstruction.residuals, places, reconstruction.data.force_rms
+    )
     rms, rms_std = found.acting_rms
     # standard errors are no smaller than a residual that is not white allows, nor than two good models differ by
     level = np.sqrt(max(float(found.chi2_by_record.mean()), 1.0))

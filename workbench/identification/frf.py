@@ -1,4 +1,4 @@
-"""Modes from measured transfer functions (FRFs) at lines of any spacing.
+"""Modes from measured frequency response functions (FRFs) at lines of any spacing.
 
     H_ji(s) = e^{-sτ_j} (Σ_r [c_jr l_ri / (s - λ_r) + conjugate] + s^k (D_ji + E_ji / s²))      at s = iω
 
@@ -19,7 +19,7 @@ from workbench.arrays import Floats
 from workbench.identification.input_output.changing_decay import beside_changing
 from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, statistic_of, vector_covariance
 from workbench.identification.input_output.modal_fit import Fit, projected, scaled_vectors, settled
-from workbench.identification.input_output.model_order import Selected, SelectionOptions, select_modes
+from workbench.identification.input_output.model_order import SelectedModes, SelectionOptions, select_modes
 from workbench.identification.input_output.peak_shape import PEAKS, overlap_remarks, parts_of, peaks
 from workbench.identification.input_output.spectral_lines import Lines, relative_noise, window_rate
 from workbench.identification.signal.clocks import CLOCKS, late_outputs
@@ -43,8 +43,8 @@ from workbench.threads import one_blas_thread
 
 
 @dataclass(frozen=True)
-class TransferSettings:
-    """Constants of the stages of an identification from transfer functions."""
+class FrfSettings:
+    """Constants of the stages of an identification from FRFs."""
 
     most_lines: int = 1500  # that are fitted together; more are fitted band by band
     band: int = 600  # lines of a band
@@ -59,12 +59,12 @@ class TransferSettings:
     alike: float = 0.2  # rms log ratio of two estimates of the noise that agree
 
 
-TRANSFER = TransferSettings()
+FRF = FrfSettings()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class TransferModes(ParticipatingModes):
-    """Modes of transfer functions.
+class FrfModes(ParticipatingModes):
+    """Modes of FRFs.
 
     Attributes:
         modes: shapes of displacement, largest entry 1.
@@ -111,11 +111,11 @@ class TransferModes(ParticipatingModes):
     evidence = Renamed("statistic")
 
 
-def coherence_noise(transfer: ArrayLike, coherence: ArrayLike, *, averages: int) -> np.ndarray:
-    """Standard error of real and imaginary part of transfer functions, |H| ((1 - γ²) / (2 γ² n))^½.
+def coherence_noise(frf: ArrayLike, coherence: ArrayLike, *, averages: int) -> np.ndarray:
+    """Standard error of real and imaginary part of FRFs, |H| ((1 - γ²) / (2 γ² n))^½.
 
     Args:
-        transfer: complex, of any shape.
+        frf: complex, of any shape.
         coherence: γ², of the same shape, in (0, 1].
         averages: n, number of independent averages.
 
@@ -124,25 +124,24 @@ def coherence_noise(transfer: ArrayLike, coherence: ArrayLike, *, averages: int)
 
     Source: Bendat & Piersol, Random Data, 4th ed., section 9.1.
     """
-    h, squared = np.asarray(transfer), np.asarray(coherence, float)
+    h, squared = np.asarray(frf), np.asarray(coherence, float)
     if squared.shape != h.shape or not ((squared > 0) & (squared <= 1)).all() or averages < 2:
         raise ValueError(
-            f"coherence must have the shape {h.shape} of the transfer functions, lie in (0, 1], and rest on two"
+            f"coherence must have the shape {h.shape} of the FRFs, lie in (0, 1], and rest on two"
             f" averages or more; got shape {squared.shape}, {averages} averages"
         )
     return np.asarray(np.abs(h) * np.sqrt((1.0 - squared) / (2.0 * squared * averages)))
 
 
 TURNED = (
-    "the impulse responses come before the impulse, as in transfer functions for e^(-iωt): their complex conjugates"
-    " were identified"
+    "the impulse responses come before the impulse, as in FRFs for e^(-iωt): their complex conjugates were identified"
 )
 
 
-@former_arguments(most_modes="max_modes")
+@former_arguments(most_modes="max_modes", transfer="frf")
 @one_blas_thread
-def identify_transfer(
-    transfer: ArrayLike,
+def identify_frf(
+    frf: ArrayLike,
     frequencies_hz: ArrayLike,
     *,
     channels: tuple[Channel, ...],
@@ -152,20 +151,20 @@ def identify_transfer(
     false_alarm: float = FALSE_ALARM,
     seconds: float | None = SECONDS,
     progress: Progress | None = None,
-) -> TransferModes:
-    """The modes of measured transfer functions, their number selected, each with its standard error.
+) -> FrfModes:
+    """The modes of measured FRFs, their number selected, each with its standard error.
 
     More than 1500 lines are fitted band by band, with overlap. Delays of outputs that the phases of the modes show are
     corrected, with a remark.
 
     Args:
-        transfer: (n_outputs, n_frequencies), or (n_outputs, n_references, n_frequencies), complex, outputs per unit
+        frf: (n_outputs, n_frequencies), or (n_outputs, n_references, n_frequencies), complex, outputs per unit
             input, for e^(iωt); those for e^(-iωt) are recognised at evenly spaced lines, and remarked. Receptance,
             mobility or accelerance by the quantity of each channel.
         frequencies_hz: (n_frequencies,) increasing, at any spacing.
         channels: one per output; where no quantity is stated, the residual terms are those of any motion.
         band_hz: lowest and highest line to fit; modes outside the band are represented by residual terms.
-        noise_std: standard error of real and imaginary part, one or of the shape of `transfer`: from repeated
+        noise_std: standard error of real and imaginary part, one or of the shape of `frf`: from repeated
             measurements, or by `coherence_noise`. It sets the relative weights of the lines; its overall level is
             estimated from the residual, and remarked where that disagrees. Without it, noise is taken to be the same at
             all lines of an output, or, where neighbouring lines show it, to depend on reference, frequency and modulus
@@ -182,7 +181,7 @@ def identify_transfer(
     """
     check_count("max_modes", max_modes)
     time_limit = TimeLimit(seconds, progress)
-    h, f, noise = _checked(transfer, frequencies_hz, channels, band_hz, noise_std)
+    h, f, noise = _checked(frf, frequencies_hz, channels, band_hz, noise_std)
     turned = _is_acausal(h, f)
     h = h.conj() if turned else h
     options = SelectionOptions(max_modes, false_alarm, time_limit)
@@ -229,16 +228,14 @@ def _in_bands(
     noise: np.ndarray | None,
     channels: Sequence[Channel],
     options: SelectionOptions,
-) -> TransferModes:
-    """The modes of all lines; more than `TRANSFER.most_lines` are fitted band by band."""
-    n_bands, lines_a_mode = (
-        (1, 3) if f.size <= TRANSFER.most_lines else (-(-f.size // TRANSFER.band), TRANSFER.lines_a_mode)
-    )
+) -> FrfModes:
+    """The modes of all lines; more than `FRF.most_lines` are fitted band by band."""
+    n_bands, lines_a_mode = (1, 3) if f.size <= FRF.most_lines else (-(-f.size // FRF.band), FRF.lines_a_mode)
     share = f.size / n_bands
 
-    def band(k: int, band_budget: TimeLimit) -> TransferModes:
+    def band(k: int, band_budget: TimeLimit) -> FrfModes:
         first, last = round(k * share), round((k + 1) * share)
-        inside = slice(max(first - TRANSFER.overlap_lines, 0), last + TRANSFER.overlap_lines)
+        inside = slice(max(first - FRF.overlap_lines, 0), last + FRF.overlap_lines)
         edges = f[first] if k else 0.0, f[last] if last < f.size else np.inf
         lines = Lines(
             h[..., inside],
@@ -264,7 +261,7 @@ def _in_bands(
     return _joined(results, channels) if n_bands > 1 else results[0]
 
 
-def _output_delays(estimate: TransferModes, channels: Sequence[Channel], least: float) -> Floats:
+def _output_delays(estimate: FrfModes, channels: Sequence[Channel], least: float) -> Floats:
     """Delay of each output relative to the inputs, (n_outputs,) s, by `late_outputs`; 0 for outputs of no motion."""
     delays, known = np.zeros(len(channels)), np.array([channel.quantity in MEASURED for channel in channels])
     if known.any() and estimate.modes.n_modes:
@@ -282,12 +279,12 @@ def _delay_remarks(delays: Floats, channels: Sequence[Channel]) -> tuple[str, ..
     )
 
 
-def _select_in_band(lines: Lines, options: SelectionOptions) -> tuple[Lines, Selected]:
+def _select_in_band(lines: Lines, options: SelectionOptions) -> tuple[Lines, SelectedModes]:
     """The lines of a band with weights, and their modes; noise not stated is estimated from the strongest modes."""
     if lines.noise is not None:
         return _select_with_changing(lines, options)
     h, time_limit = lines.h, options.time_limit
-    few = replace(options, max_modes=min(TRANSFER.strongest, options.max_modes))
+    few = replace(options, max_modes=min(FRF.strongest, options.max_modes))
     selected = select_modes(lines, few)
     guessed = relative_noise(lines, selected.fit)
     if guessed is None:  # noise proportional to the response would look like modes that change
@@ -318,8 +315,8 @@ def _select_in_band(lines: Lines, options: SelectionOptions) -> tuple[Lines, Sel
 
 
 def _select_with_changing(
-    lines: Lines, options: SelectionOptions, selected: Selected | None = None
-) -> tuple[Lines, Selected]:
+    lines: Lines, options: SelectionOptions, selected: SelectedModes | None = None
+) -> tuple[Lines, SelectedModes]:
     """The lines with columns for the motion of modes that change, and the modes, one for each that changes."""
     selected = select_modes(lines, options) if selected is None else selected
     while (change := beside_changing(lines, selected.fit, selected.limit, options.time_limit)) is not None:
@@ -328,14 +325,14 @@ def _select_with_changing(
     return lines, selected
 
 
-def _select_weighted(lines: Lines, selected: Selected, options: SelectionOptions) -> tuple[Lines, Selected]:
+def _select_weighted(lines: Lines, selected: SelectedModes, options: SelectionOptions) -> tuple[Lines, SelectedModes]:
     """The lines and their modes, with alternating estimates of noise and modes, for outputs of uncorrelated noise."""
     time_limit = options.time_limit
     before: np.ndarray | None = None
-    for _ in range(TRANSFER.noise_rounds):
+    for _ in range(FRF.noise_rounds):
         guessed = relative_noise(lines, selected.fit)
         if guessed is None or (
-            before is not None and np.log(guessed / before).std(axis=(1, 2)).max() < TRANSFER.alike  # up to a factor
+            before is not None and np.log(guessed / before).std(axis=(1, 2)).max() < FRF.alike  # up to a factor
         ):
             break
         if time_limit.spent("estimation of the noise"):
@@ -353,11 +350,11 @@ def _select_weighted(lines: Lines, selected: Selected, options: SelectionOptions
 
 def _modes_of(
     lines: Lines,
-    selected: Selected,
+    selected: SelectedModes,
     channels: Sequence[Channel],
     edges_hz: tuple[float, float],
     shown_hz: np.ndarray,
-) -> TransferModes:
+) -> FrfModes:
     """The result for a band.
 
     Args:
@@ -378,7 +375,7 @@ def _modes_of(
     stated = lines.weights is not None and not lines.guessed
     correlation = None if stated else correlation_of_lines([lines.left(fit).reshape(len(channels), -1)])
     covariance = pole_covariance(fit, noise_ratio * disturbed(correlation, fit.amplitudes / fit.noise[:, None]))
-    sure = np.sqrt(np.diag(covariance)[: fit.poles.size]) < TRANSFER.most_error * np.abs(fit.poles)
+    sure = np.sqrt(np.diag(covariance)[: fit.poles.size]) < FRF.most_error * np.abs(fit.poles)
     sure &= fit.poles.real < SURE * np.sqrt(np.diag(covariance)[fit.poles.size :]) * np.abs(fit.poles)
     within = (fit.poles.imag >= lines.omega[0]) & (fit.poles.imag <= lines.omega[-1])
     within &= (damped_hz >= edges_hz[0]) & (damped_hz < edges_hz[1])
@@ -390,7 +387,7 @@ def _modes_of(
     kept = np.r_[inside, fit.poles.size + inside]
     at = np.searchsorted(lines.omega, 2.0 * np.pi * shown_hz[0])
     below, below_std, above = _residual_terms(lines, fit, noise_ratio, derivative[:, 0])
-    return TransferModes(
+    return FrfModes(
         modes=SampledModes.of_poles(poles, shapes, _places(channels)),
         covariance=frozen(covariance[np.ix_(kept, kept)]),
         vector_covariance=frozen(vectors),
@@ -447,13 +444,13 @@ def _residual_terms(
 
 
 def _is_acausal(h: np.ndarray, f: np.ndarray) -> bool:
-    """Whether impulse responses precede the impulse: transfer functions of the opposite sign convention."""
+    """Whether impulse responses precede the impulse: FRFs of the opposite sign convention."""
     step = np.diff(f)
     if np.ptp(step) > 1e-6 * step.max():
         return False
     power = (np.abs(np.fft.ifft(h * np.hanning(f.size), axis=-1)) ** 2).sum(axis=(0, 1))
     after, before = power[1 : f.size // 2].sum(), power[-(f.size // 2) + 1 :].sum()
-    return bool(before > TRANSFER.acausal * after)
+    return bool(before > FRF.acausal * after)
 
 
 def _window_remark(rate: float) -> tuple[str, ...]:
@@ -469,12 +466,12 @@ def _window_remark(rate: float) -> tuple[str, ...]:
 def _noise_remark(misfit: Floats) -> tuple[str, ...]:
     """A remark where the residual, as the median of all outputs, is not as large as the stated noise."""
     ratio = float(np.median(misfit))
-    if 1.0 / TRANSFER.disagrees < ratio < TRANSFER.disagrees:
+    if 1.0 / FRF.disagrees < ratio < FRF.disagrees:
         return ()
     return (f"the residual is {ratio:.2g} times noise_std; standard errors are based on the residual",)
 
 
-def _scatter_remark(estimate: TransferModes) -> tuple[str, ...]:
+def _scatter_remark(estimate: FrfModes) -> tuple[str, ...]:
     """A remark on modes whose peak in the FRFs is not that of a single pole."""
     which = [
         mode_text(r, estimate.modes.frequencies_hz[r], f", by {scatter:.3g} Hz rms")
@@ -484,9 +481,9 @@ def _scatter_remark(estimate: TransferModes) -> tuple[str, ...]:
     if not which:
         return ()
     lines = 2.0 * estimate.modes.zeta * estimate.modes.frequencies_hz / np.diff(estimate.frequencies_hz).min()
-    narrow = [str(r + 1) for r in np.flatnonzero((estimate.scatter_hz > 0) & (lines < TRANSFER.resolved))]
+    narrow = [str(r + 1) for r in np.flatnonzero((estimate.scatter_hz > 0) & (lines < FRF.resolved))]
     leaks = (
-        f". Fewer than {TRANSFER.resolved:g} lines lie in the half-power bandwidth of mode{'s' * (len(narrow) > 1)}"
+        f". Fewer than {FRF.resolved:g} lines lie in the half-power bandwidth of mode{'s' * (len(narrow) > 1)}"
         f" {', '.join(narrow)}: if"
         " these are averages by Hann's window, its leakage makes that damping too high"
     )
@@ -497,7 +494,9 @@ def _scatter_remark(estimate: TransferModes) -> tuple[str, ...]:
     )
 
 
-def _clustered(lines: Lines, selected: Selected, channels: Sequence[Channel]) -> tuple[Fit, list[tuple[float, ...]]]:
+def _clustered(
+    lines: Lines, selected: SelectedModes, channels: Sequence[Channel]
+) -> tuple[Fit, list[tuple[float, ...]]]:
     """The fit with one mode per cluster, and for each mode the frequencies of the other members, Hz."""
     fit = selected.fit
     shapes = fit.amplitudes / fit.poles ** time_derivatives(channels)[:, None]
@@ -514,7 +513,7 @@ def _clustered(lines: Lines, selected: Selected, channels: Sequence[Channel]) ->
     return settled(lines, projected(lines, mean_poles[kept], fit.participation[kept])), cluster_hz
 
 
-def _joined(bands: Sequence[TransferModes], channels: Sequence[Channel]) -> TransferModes:
+def _joined(bands: Sequence[FrfModes], channels: Sequence[Channel]) -> FrfModes:
     """The results of all bands in one."""
     modes_by_band = [band.modes for band in bands]
     n = [modes.n_modes for modes in modes_by_band]
@@ -524,7 +523,7 @@ def _joined(bands: Sequence[TransferModes], channels: Sequence[Channel]) -> Tran
     omega, zeta = (np.concatenate([getattr(modes, name) for modes in modes_by_band]) for name in ("omega", "zeta"))
     shapes = np.hstack([modes.shapes for modes in modes_by_band])
     share = np.array([band.frequencies_hz.size for band in bands]) / sum(band.frequencies_hz.size for band in bands)
-    return TransferModes(
+    return FrfModes(
         modes=SampledModes(omega, zeta, shapes, _places(channels)),
         covariance=frozen(covariance[np.ix_(kept, kept)]),
         vector_covariance=frozen(np.concatenate([band.vector_covariance for band in bands])),
@@ -557,25 +556,25 @@ def _places(channels: Sequence[Channel]) -> np.ndarray:
 
 
 def _checked(
-    transfer: ArrayLike,
+    frf: ArrayLike,
     frequencies_hz: ArrayLike,
     channels: Sequence[Channel],
     band_hz: tuple[float, float] | None,
     noise_std: ArrayLike | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    h, f = np.asarray(transfer, complex), np.asarray(frequencies_hz, float)
+    h, f = np.asarray(frf, complex), np.asarray(frequencies_hz, float)
     h = h[:, None] if h.ndim == 2 else h
     if h.ndim != 3 or h.shape[0] != len(channels) or h.shape[1] == 0 or f.shape != h.shape[2:]:
         raise ValueError(
-            f"transfer functions must have shape ({len(channels)} outputs, [n_references,] {f.size} frequencies); got"
-            f" {np.shape(transfer)}. Is frequency the last axis?"
+            f"FRFs must have shape ({len(channels)} outputs, [n_references,] {f.size} frequencies); got"
+            f" {np.shape(frf)}. Is frequency the last axis?"
         )
     if not np.isfinite(f).all() or (np.diff(f) <= 0).any():
-        raise ValueError("transfer functions need finite frequencies that increase; sort them, each once")
+        raise ValueError("FRFs need finite frequencies that increase; sort them, each once")
     noise = None if noise_std is None else np.asarray(noise_std, float)
-    if noise is not None and noise.shape not in ((), np.shape(transfer)):
-        raise ValueError(f"noise_std must have the shape of transfer, {np.shape(transfer)}; got {noise.shape}")
-    noise = None if noise is None else np.broadcast_to(noise, np.shape(transfer)).reshape(h.shape)
+    if noise is not None and noise.shape not in ((), np.shape(frf)):
+        raise ValueError(f"noise_std must have the shape of frf, {np.shape(frf)}; got {noise.shape}")
+    noise = None if noise is None else np.broadcast_to(noise, np.shape(frf)).reshape(h.shape)
     if noise is not None and not ((noise > 0) & np.isfinite(noise)).all():
         raise ValueError("noise_std must be positive and finite at every line; give lines without noise a floor")
     low, high = (0.0, np.inf) if band_hz is None else band_hz
