@@ -76,7 +76,7 @@ def plant(index, seed, searched=False):
     best = redesign(sure, law, test=test, draws=1, seed=index, placement=False)
     weight = force_weight(best.after, best.controlled)
     impulse_input = next(a for a in rig.actuators if a.direct or a.at == test.impulse_at).name
-    bounded = replace(found, more_work=NO_MORE)
+    bounded = replace(found, max_work_increase=NO_MORE)
     used = {
         "nominal": found.present,
         "redesigned": found.controller,

@@ -60,7 +60,7 @@ def plant(index, seed):
 
     def designed(*effects):
         uncertain = UncertainRig(rig, effects, np.zeros((len(effects),) * 2))
-        return redesign(uncertain, law, test=test, draws=1, placement=False, more_cost=np.inf)
+        return redesign(uncertain, law, test=test, draws=1, placement=False, max_cost_increase=np.inf)
 
     nominal = designed()
     free = controlled(real, nominal.present)

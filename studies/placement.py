@@ -68,16 +68,17 @@ def study(outcome, data=None):
     squares = (modes.phi(6.3)[0] / modes.omega) ** 2
     sensors = {k: place_sensors(modes, 4, k, 1.0, mean_squares=squares, starts=1) for k in (4, 6)}
     outcome.table(
-        "sensors", {k: {"positions": s.positions, "error": s.error, "even": s.even_error} for k, s in sensors.items()}
+        "sensors",
+        {k: {"positions": s.positions, "error": s.error, "even": s.evenly_spaced_error} for k, s in sensors.items()},
     )
     outcome.check(
         "error of a filter's coordinates, sensors placed over even, worst of 4 and 6 sensors",
-        max(s.error / s.even_error for s in sensors.values()),
+        max(s.error / s.evenly_spaced_error for s in sensors.values()),
         1.0,
     )
     outcome.say(
         "; ".join(
-            f"{k} sensors of a filter: {s.even_error:.1%} of error evenly spaced, {s.error:.1%} placed"
+            f"{k} sensors of a filter: {s.evenly_spaced_error:.1%} of error evenly spaced, {s.error:.1%} placed"
             for k, s in sensors.items()
         )
     )

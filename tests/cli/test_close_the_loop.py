@@ -25,4 +25,4 @@ def test_the_commands_of_the_page_close_the_loop(run, tmp_path, monkeypatch):
     assert "A delay of the actuators (all: delay 0.004 s)" in said["diagnose"]
     assert "stable on 200 of 200 Monte Carlo samples" in said["redesign"] and "the redesigned one" in said["redesign"]
     assert "command of F2, 2 samples ago" in Path("after.h").read_text(encoding="utf-8")
-    assert "the model held on 1 of 1 tests" in said["check"]
+    assert "the model is validated on 1 of 1 tests" in said["check"]

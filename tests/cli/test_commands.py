@@ -171,7 +171,7 @@ def test_designs_and_placements_are_told_in_the_units_of_the_file(rig, tmp_path)
     laws = run("design", rig, "--controlled-modes", 4, "--weight", 20).output
     assert "W_C [N mm]  W_R [N mm]" in laws and "R weights FᵀF" in laws
     placed = run("place", rig, "--controlled-modes", 2, "--figure", tmp_path / "places.png")
-    assert "places [mm]" in placed.output and "W_R [N mm]" in placed.output and (tmp_path / "places.png").is_file()
+    assert "positions [mm]" in placed.output and "W_R [N mm]" in placed.output and (tmp_path / "places.png").is_file()
 
 
 def test_design_reports_the_works_of_section_5_8(rig, tmp_path):
@@ -340,7 +340,7 @@ def test_a_plate_is_placed_outside_a_zone_and_drawn(plate, tmp_path):
     zone = ("--forbid", "0.3,0.2:0.6,0.5")
     result = run("place", plate, "--controlled-modes", 2, "--weight", 0.01, *zone, "--figure", picture, "--json", found)
     assert result.exit_code == 0, result.output
-    assert "unit impulse at (x, y) = (0.5, 0.46)" in result.output and "places [m]" in result.output
+    assert "unit impulse at (x, y) = (0.5, 0.46)" in result.output and "positions [m]" in result.output
     best, own = json.loads(found.read_text())["placements"]
     assert own["positions"] == [[0.3, 0.24], [0.84, 0.52]]
     assert best["residual_work"] < own["residual_work"] and best["effort"] <= 1.5 * own["effort"] * (1 + 1e-6)

@@ -85,11 +85,11 @@ def test_tests_are_checked_and_logged_beside_the_case(run, case):
         done = run("check", "late", f"{name}.csv", *options)
         assert done.exit_code == 0, done.output
         assert json.loads((case / "told.json").read_text())["holds"] is holds
-    assert "held on 1 of 2 tests" in done.output
-    assert "held on 1 of 2 tests" in run("check", "late", f"{name}.csv", *options).output, "one record is one test"
+    assert "validated on 1 of 2 tests" in done.output
+    assert "validated on 1 of 2 tests" in run("check", "late", f"{name}.csv", *options).output, "one record is one test"
     with (case / "late" / "tests.csv").open(newline="") as file:
         assert [row["holds"] for row in csv.DictReader(file)] == ["yes", "no", "no"]
-    assert "The model does not hold" in (case / "out" / "late-check.html").read_text()
+    assert "The record is not consistent with the model" in (case / "out" / "late-check.html").read_text()
 
 
 def test_a_fitted_record_is_no_test_in_other_digits_or_cut_short_either(run, case):

@@ -67,7 +67,7 @@ def test_what_is_redesigned_is_what_was_exported(run, case, tmp_path):
     none = json.loads(verdict.read_text())
     none["posterior"] |= {"effects": [], "covariance": []}
     (tmp_path / "none.json").write_text(json.dumps(none))
-    quick = ("--verdict", tmp_path / "none.json", "--draws", 1, "--more-work", 0, "--more-cost", 0)
+    quick = ("--verdict", tmp_path / "none.json", "--draws", 1, "--max-work-increase", 0, "--max-cost-increase", 0)
     done = run("redesign", folder, *options, *quick, "--page", tmp_path / "p.html", "--to", told)
     assert "the present one, which is kept" in done.output, done.output
     first, second = (run_path(str(path))["Controller"]() for path in (code, told))

@@ -101,7 +101,7 @@ def test_sensors_of_a_filter_placed():
     found = modes(12)
     squares = 1.0 / np.arange(1, 13) ** 4
     placed = place_sensors(found, 3, 4, 1.0, mean_squares=squares, starts=0)
-    assert not placed.exhaustive and placed.error <= placed.even_error
+    assert not placed.exhaustive and placed.error <= placed.evenly_spaced_error
     assert placed.error == pytest.approx(filter_error(found, range(3), placed.positions, 1.0, squares))
     few = np.linspace(1.0, 9.0, 7)
     best = place_sensors(found, 3, 3, 1.0, mean_squares=squares, candidates=few)

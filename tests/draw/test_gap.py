@@ -43,7 +43,7 @@ def test_along_a_structure_the_likeliest_place_is_on_top_and_all_of_the_curve_in
     assert low > below.max() and 0 < high < below.min() and below.argmin() == 14
     names = [label.get_text() for label in ax.get_yticklabels()]
     assert names == ["≤ 0.1", "1", "10", "100", "1000"] and "-" not in "".join(names)
-    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["likeliest", "named effect"]
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["most likely position", "named effect"]
 
 
 def test_over_a_plate_places_have_a_colour_bar_and_marks_a_legend():
@@ -56,7 +56,7 @@ def test_over_a_plate_places_have_a_colour_bar_and_marks_a_legend():
     assert bar.get_ylabel() == "log-likelihood below its maximum [-]"
     bottom, top = bar.get_ylim()
     assert top == pytest.approx(ALIKE) and bottom == pytest.approx(np.ptp(profile))
-    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["likeliest", "named effect"]
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["most likely position", "named effect"]
     assert all(line.get_path_effects() for line in ax.lines), "each has a white edge"
 
 
@@ -70,7 +70,11 @@ def test_named_points_that_fit_alike_have_bars_that_are_seen():
     lengths = [np.log(box[1] / box[0]) / np.log(high / low) for box in bars["boxes"]]
     assert min(lengths) > 0.05 and max(lengths) < 1.0
     np.testing.assert_allclose([box[1] for box in bars["boxes"]], [ALIKE, ALIKE, ALIKE, 37.0, 2997.0])
-    assert [t["text"] for t in panel["marks"] if t["kind"] == "text"] == ["likeliest", "as likely", "as likely"]
+    assert [t["text"] for t in panel["marks"] if t["kind"] == "text"] == [
+        "most likely",
+        "equally likely",
+        "equally likely",
+    ]
     assert [name for _, name in panel["y"]["ticks"]] == ["a.x", "e.x", "c.x", "b.x (named)", "d.x"]
     assert panel["x"]["ticks"][0][1] == "≤ 0.1"
 

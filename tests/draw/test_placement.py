@@ -27,7 +27,7 @@ def test_along_a_beam_sensors_stand_under_the_shapes_of_the_controlled_modes():
         x, shape = line.get_data()
         np.testing.assert_allclose(np.abs(shape), np.abs(np.sin(r * np.pi * x / 2.0)), atol=1e-4)
     np.testing.assert_allclose(left.lines[-1].get_xdata(), placed.positions)
-    assert left.get_xlabel() == "x [m]" and "at even places" in figure.get_suptitle()
+    assert left.get_xlabel() == "x [m]" and "evenly spaced" in figure.get_suptitle()
     errors = drawn_errors(figure)  # add up to the error of all, as independent ones do
     assert np.linalg.norm(list(errors.values())) == pytest.approx(100 * placed.error) and list(errors) == [
         1,

@@ -80,7 +80,7 @@ def test_an_explanation_at_named_points_is_printed_and_drawn():
     )
     assert "  y → F1" in str(explained) and str(explained).startswith("closed loop of 3 modes: ")
     assert "y → F1" in [label.get_text() for label in plot(explained).axes[1].get_yticklabels()]
-    assert "place [m]" not in str(law)
+    assert "position [m]" not in str(law)
 
 
 @pytest.mark.filterwarnings("error")

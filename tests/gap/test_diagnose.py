@@ -75,7 +75,7 @@ def test_hard_pairs_are_named_and_placed(seed, kinds):
 def test_a_law_beyond_the_catalogue_is_unknown_and_shown(kind, exponent):
     case, _ = make_trial(401, kinds=(kind,))
     verdict = verdict_on(case)
-    (shown,) = verdict.to_json()["nearest"]
+    (shown,) = verdict.to_json()["best_fit"]
     assert verdict.outcome == "unknown" and verdict.to_json()["effects"][0]["kind"] == "unknown"
     assert shown["parameters"]["exponent"] == pytest.approx(exponent, abs=0.05)
     assert "power-law" in verdict.sentence and verdict.shrinkage.overall > 0.95
@@ -87,7 +87,7 @@ def test_a_weak_law_beyond_the_catalogue_does_not_pass_for_one_of_it():
     """A clearance leaves no more than the noise here; a power of the displacement is likelier by far."""
     case, _ = make_trial(441050, kinds=("quadratic_spring",))
     verdict = verdict_on(case)
-    (shown,) = verdict.to_json()["nearest"]
+    (shown,) = verdict.to_json()["best_fit"]
     assert verdict.outcome == "unknown" and shown["parameters"]["exponent"] == pytest.approx(2.0, abs=0.1)
     assert verdict.alternatives[0][0] == "clearance"
 
@@ -111,7 +111,7 @@ def test_a_search_whose_time_is_spent_ends_with_what_it_has(nothing_hidden):
     rig = kind_named("actuator_gain").apply(nothing_hidden.rig, drive, {"gain": 0.1})
     verdict = diagnose(rig, nothing_hidden.fit[:2], workers=1, seconds=1e-3)
     assert verdict.outcome in ("part", "unknown") and any("`seconds` 0.001;" in note for note in verdict.notes)
-    assert verdict.sentence.startswith("None of the effects tried before the time was spent explains the gap")
+    assert verdict.sentence.startswith("None of the effects tried before the time limit explains the gap")
 
 
 def test_nothing_hidden_nothing_told(quiet_verdict):
@@ -304,7 +304,7 @@ def test_wires_that_are_surely_exchanged_are_put_right_before_the_search(hinged_
     assert verdict.shrinkage.overall > 0.95 and sum(verdict.budget.effects.values()) > 0.95
     assert [f.effects[0].kind for f in verdict.attribution.tried] == [gain.kind]  # the exchange was not searched for
     assert [f.labels for f in verdict.attribution.singles] == [(exchange.label,), (gain.label, exchange.label)]
-    assert plot_single_effects(verdict).axes[0].get_title("left") == "best fit of each effect beside the exchange"
+    assert plot_single_effects(verdict).axes[0].get_title("left") == "best fit of each effect with the exchange"
     one = diagnose(rig, fitted, validation=replace(kept, outputs=kept.outputs[[2, 1, 0, 3]]), catalogue=both, workers=1)
     assert exchange.kind in {f.effects[0].kind for f in one.attribution.tried}  # not in every record, so it is
     without = diagnose(rig, fitted, validation=kept, catalogue=(gain.kind,), workers=1)

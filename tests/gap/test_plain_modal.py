@@ -183,7 +183,7 @@ def test_a_limit_and_a_gain_are_found_beside_shapes_that_are_off(spacecraft):
         [bar.get_x() + bar.get_width() for bar in axes[5].patches],
         [label.get_text() for label in axes[5].get_yticklabels()],
     )
-    assert below == sorted(below) and below[0] == pytest.approx(ALIKE) and axes[5].texts[0].get_text() == "likeliest"
+    assert below == sorted(below) and below[0] == pytest.approx(ALIKE) and axes[5].texts[0].get_text() == "most likely"
     assert names[0] == rig.modes.domain.text(place.at) and len(names) == len(place.places)
 
 

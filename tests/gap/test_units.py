@@ -100,7 +100,7 @@ def test_a_verdict_tells_its_numbers_by_the_names_of_the_units(hinged_rig, recor
     millimetres = named_units.Units("mm", "t", "s", "N")
     verdict = diagnose(rig, (record,), catalogue=(kind_named("point_mass"),), workers=1, units=millimetres)
     assert re.search(r"mass 0\.5\S* (± \S+ )?t\)", verdict.sentence) and verdict.to_json()["units"]["length"] == "mm"
-    assert verdict_tables(verdict.to_json())[0][1][4] == "place [mm]"
+    assert verdict_tables(verdict.to_json())[0][1][4] == "position [mm]"
     assert " kg)" in replace(verdict, units=named_units.SI).sentence
 
 

@@ -99,7 +99,7 @@ def test_a_model_holds_on_its_own_tests_and_not_on_others(plain):
         checks.append(check_prediction(predict(uncertain(plain), new, seed=3), new))
     assert [check.holds for check in checks] == [True, True, False]
     assert checks[2].coverage.min() < checks[2].expected_least
-    assert "does not hold" in checks[2].sentence and "worst is sensor" in checks[2].sentence
+    assert "not consistent with the model" in checks[2].sentence and "worst is sensor" in checks[2].sentence
 
 
 @pytest.mark.parametrize("n", [60, 100, 200])
@@ -110,7 +110,7 @@ def test_a_model_holds_where_its_worst_sensor_has_what_is_expected_of_it(n):
     for share in shares:
         check = PredictionCheck("r", ("a", "b"), 100, [1.0, share], np.zeros((2, 0)), np.zeros((0, 2)), expected)
         assert check.holds is bool(share >= check.expected_least) is bool(share > n // 100 / n)
-        assert ("The model holds" in check.sentence) is check.holds
+        assert ("is consistent with the model" in check.sentence) is check.holds
         assert not replace(check, allowed=1.15).holds
     assert "no test of the model: its bands allow for an error of 115 %" in replace(check, allowed=1.15).sentence
 

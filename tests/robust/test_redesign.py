@@ -122,7 +122,7 @@ def test_a_residual_mode_that_control_leaves_undamped_is_named(rig, controller):
             ("present_verification", found.present_verification),
         )
     }
-    assert "Mode 4, which is not controlled, keeps" in replace(found, **alike).sentence
+    assert "Spillover lowers the damping ratio of residual mode 4 from" in replace(found, **alike).sentence
     damping[:, 3] = 0.6 * own[3]
     alike = {
         name: replace(verification, damping=damping)
@@ -131,7 +131,7 @@ def test_a_residual_mode_that_control_leaves_undamped_is_named(rig, controller):
             ("present_verification", found.present_verification),
         )
     }
-    assert not replace(found, **alike).left_undamped
+    assert not replace(found, **alike).spillover_warning
 
 
 def test_what_the_shapes_are_at_an_actuator_is_no_imperfection_of_it(rig, controller):
@@ -204,15 +204,18 @@ def test_the_present_controller_is_kept_where_the_redesigned_does_no_better(
     found = replace(
         sure, present_verification=present, verification=told(stable, vibration, np.negative(work)), weight=0.5
     )
-    assert replace(found, more_work=np.inf).improves or max(vibration) > 0.99
-    found = replace(found, more_work=0.05)
+    assert replace(found, max_work_increase=np.inf).improves or max(vibration) > 0.99
+    found = replace(found, max_work_increase=0.05)
     assert found.improves is pays
     assert found.controller is (found.redesigned if pays else found.present)
     assert ("Keep the present controller" in found.sentence) is not pays
     assert found.advice.startswith("Use the redesigned" if pays else "Keep the present") and "inf" not in found.advice
     if max(vibration) < 1.0 and not pays:  # it is better, for more work: the sentence says how much to allow
-        allowed = float(re.search(r"more_work = (\S+) allows it", found.sentence)[1])
-        assert replace(found, more_work=allowed).improves and not replace(found, more_work=allowed - 0.02).improves
+        allowed = float(re.search(r"max_work_increase = (\S+) allows it", found.sentence)[1])
+        assert (
+            replace(found, max_work_increase=allowed).improves
+            and not replace(found, max_work_increase=allowed - 0.02).improves
+        )
     back = replace(sure, present_verification=found.verification, verification=present, weight=0.5)
     assert back.improves or pays or stable == [True, True], "more stable draws come first"
 
@@ -237,7 +240,9 @@ def test_a_law_is_judged_by_what_it_is_for(rig, controller):
     assert "settles the controlled modes in 0.7 s where the present one settles them in 1 s" in sooner.advice
     assert "for 1.1 times the effort (medians); it does better on 2 of 2 samples" in sooner.advice
     dear = judged(found, 1.0, 0.9, 1.5)
-    assert not dear.improves and "costs 20 % more, time and effort taken together: more_cost = 0.2" in dear.advice
+    assert (
+        not dear.improves and "costs 20 % more, time and effort taken together: max_cost_increase = 0.2" in dear.advice
+    )
     asked = redesign(
         uncertain(rig), controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False, criterion="settling"
     )
@@ -515,7 +520,7 @@ def test_what_cannot_be_redesigned_is_named(rig, controller):
     for given, match in (
         ({"test": "impulse"}, "the test must be a LoopTest; got str"),
         ({"sample_time": "0.01"}, "sample_time is a number in s; got '0.01'"),
-        ({"more_cost": None}, "more_cost is a number; got None"),
+        ({"max_cost_increase": None}, "max_cost_increase is a number; got None"),
         ({"draws": "2"}, "is a whole number, 1 or more; got '2'"),
         ({"seed": None}, "seed is a whole number, 0 or more; got None"),
     ):

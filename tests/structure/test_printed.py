@@ -100,7 +100,7 @@ def test_what_is_designed_and_checked_prints_no_array():
     check = SelfCheck(np.array([0.01, -0.02]), np.array([1.0, 0.9]))
     for result in (frame, sensors, through, filtered(law, through), check):
         assert len(repr(result)) < 200 and "array(" not in repr(result) + str(result)
-    assert str(check).splitlines()[2].split() == ["1", "1", "1.0000"] and "at most 2 % off" in str(check)
+    assert str(check).splitlines()[2].split() == ["1", "1", "1.0000"] and "largest frequency error 2 %" in str(check)
     assert "4 degrees of freedom at 4 nodes" in repr(frame) and "y1" in str(filtered(law, through))
 
 

@@ -26,10 +26,10 @@ from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import PointShapes
 from workbench.study.bench import bench_server
 from workbench.study.catalogue import describe, run_study
+from workbench.study.design_evaluation import design_from, read_structure, results_of, setting, start, try_out
 from workbench.study.runs.cases import StudyError
 from workbench.study.runs.outcome import Outcome
 from workbench.study.saved_design import save
-from workbench.study.trying import design_from, read_structure, results_of, setting, start, try_out
 from workbench.trials.plane_frame import Section, plane_frame
 
 RIG, TEXT, _ = read_structure(None)

@@ -9,7 +9,7 @@ from workbench.study.report import page_content_about, page_content_in
 from workbench.study.runs.cases import StudyError
 
 VERDICT = {
-    "case": "arm", "outcome": "explained", "sentence": "A spring explains it.", "nearest": [], "notes": ["a note"],
+    "case": "arm", "outcome": "explained", "sentence": "A spring explains it.", "best_fit": [], "notes": ["a note"],
     "effects": [{"kind": "ground_spring", "parameters": {"stiffness": 2.0}, "parameters_std": {"stiffness": 0.1},
                  "parameters_unit": {"stiffness": "N/m"}, "at": 3.1234, "at_std": 0.02}],
     "alternatives": [{"kind": "point_mass", "probability": 0.01}], "next_experiment": "Strike it.",
@@ -62,7 +62,7 @@ def test_a_page_says_where_effects_are_and_what_the_rest_is(tmp_path):
     effects, gaps, _ = page_content_in(written(tmp_path, {**VERDICT, "effects": [pair, named], "gap": gap})).tables
     assert effects[2][0][2:] == ["0.1235", "", "(0.630 ± 0.011, 0.7)", ""]
     assert effects[2][1][2:] == ["2", "", "P1", ""]
-    assert gaps[1][1:3] == ["before [%]", "after [%]"] and gaps[1][4] == "share of the rms closed [%]"
+    assert gaps[1][1:3] == ["before [%]", "after [%]"] and gaps[1][4] == "reduction of the rms [%]"
     assert gaps[2] == [["r", 1.527, 1.504, 1.015, "", "noise of the logged inputs, which no model predicts"]]
     quieter = {**gap, "input_noise": {"r": 0.005}}
     assert len(page_content_in(written(tmp_path, {**VERDICT, "gap": quieter})).tables[1][1]) == 5

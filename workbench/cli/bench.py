@@ -26,7 +26,7 @@ def bench(
     import webbrowser
 
     from workbench.study.bench import bench_server
-    from workbench.study.trying import read_structure
+    from workbench.study.design_evaluation import read_structure
 
     found, text, units = read_structure(rig)
     with bench_server(found, text, units, port=port) as server:

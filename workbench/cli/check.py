@@ -50,7 +50,7 @@ def check(
     log_test(log, result)
     tests = {test["record"]: test for test in read_log(log)}  # the last check of each record
     held = sum(test["holds"] == "yes" for test in tests.values())
-    say(f"  log        {short(log)}: the model held on {held} of {len(tests)} tests")
+    say(f"  log        {short(log)}: the model is validated on {held} of {len(tests)} tests")
     write_json(
         json_path,
         {

@@ -39,7 +39,9 @@ def place(
     impulse_at: options.ImpulseAt = None,
     effort_ratio: Annotated[
         float,
-        typer.Option(help="Effort limit, as a multiple of that of even places (beam) or of the rig's own actuators."),
+        typer.Option(
+            help="Effort limit, as a multiple of that of evenly spaced positions (beam) or of the rig's own actuators."
+        ),
     ] = 1.5,
     spacing: Annotated[
         float | None,
@@ -87,7 +89,8 @@ def place(
     check_target(json_path, picture, figure=picture)
     if not effort_ratio > 0:
         raise ValueError(
-            f"--effort-ratio is a multiple, above 0, of the effort at even places or the rig's; got {effort_ratio:g}"
+            f"--effort-ratio is a multiple, above 0, of the effort at evenly spaced positions or the rig's; got"
+            f" {effort_ratio:g}"
         )
     if spacing is not None and not 0 <= spacing < math.inf:
         raise ValueError(f"--spacing must be 0 or more; got {spacing:g}")
@@ -131,7 +134,7 @@ def place(
             def proving(bound: float, work: float, cells: int) -> None:
                 share = bound / work
                 done = min(share / (1.0 - certified_gap), 1.0)
-                report(f"proving: at least {share:.1%} of W_R, {cells:,} cells", 0.5 + 0.5 * done)
+                report(f"branch and bound: at least {share:.1%} of W_R, {cells:,} cells", 0.5 + 0.5 * done)
 
             certificate = certify(task, limits, placement=best, gap=certified_gap, progress=proving)
     rows = [best, reference]
@@ -148,7 +151,7 @@ def place(
         shown.append((name, places_text(row.positions), *(f"{value:.5g}" for value in numbers)))
     where = domain.text(impulse_point, 6)
     say(f"{control} of {modes.n_modes} modes controlled, unit impulse at {where}, R = {weight:g}", bold=True)
-    where = "points" if isinstance(domain, NamedPoints) else "places [m]"
+    where = "points" if isinstance(domain, NamedPoints) else "positions [m]"
     headings = map(units.named, (where, "W_R [J]", *command_headings(unit_of_commands)))
     show_table(("placement", *headings, "condition number of B"), shown)
     say("  W_R: work of the actuators on the residual modes, which start at rest, without damping and over all time")

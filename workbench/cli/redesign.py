@@ -51,11 +51,21 @@ def redesign(
             " unless given.",
         ),
     ] = None,
-    more_cost: Annotated[
-        float, typer.Option(help="Share by which a new controller that settles sooner may cost more than the present.")
+    max_cost_increase: Annotated[
+        float,
+        typer.Option(
+            "--max-cost-increase",
+            "--more-cost",
+            help="Share by which a new controller that settles sooner may cost more than the present.",
+        ),
     ] = 0.01,
-    more_work: Annotated[
-        float, typer.Option(help="Share by which that controller may do more work; unlimited unless given.")
+    max_work_increase: Annotated[
+        float,
+        typer.Option(
+            "--max-work-increase",
+            "--more-work",
+            help="Share by which that controller may do more work; unlimited unless given.",
+        ),
     ] = float("inf"),
     draws: Annotated[
         int,
@@ -115,8 +125,8 @@ def redesign(
             draws=draws,
             seed=seed,
             criterion=criterion,
-            more_cost=more_cost,
-            more_work=more_work,
+            max_cost_increase=max_cost_increase,
+            max_work_increase=max_work_increase,
             units=found.units,
             progress=sub_progress(report, 0.7, 1.0),
         )
@@ -127,7 +137,7 @@ def redesign(
         size, where = f"{test.impulse:.3g} {found.units.named('N s')}", rig.modes.domain.text(test.impulse_at, 4)
         say(f"  test: an impulse of {size} at {where}, which moves the structure as far as the records did")
     steps = [(step.name, step.what, step.lost, step.in_new_controller) for step in result.steps]
-    show_table(("step", "what", "loss", "in the new controller"), steps)
+    show_table(("step", "change", "performance loss", "in the new controller"), steps)
     say(f"  {LOSS}")
     if result.relocation is not None:
         say(f"  {result.relocation.sentence}")

@@ -87,7 +87,7 @@ def plot_work(spillovers: dict[str, Spillover]) -> Figure:
 def _without_residual_modes() -> Figure:
     figure, ax = new_figure(width=9, height=1.5)
     ax.axis("off")
-    ax.text(0.5, 0.5, "every mode is controlled: no mode is residual, and nothing spills over", ha="center")
+    ax.text(0.5, 0.5, "every mode is controlled: no mode is residual, and there is no spillover", ha="center")
     return figure
 
 

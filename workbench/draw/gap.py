@@ -171,7 +171,7 @@ def _plot_places(ax: Axes, verdict: Verdict) -> None:
         return
     below, most = _below(place.profile)
     ax.plot(place.places, below, color=COLOURS[3])
-    ax.axvline(place.at, color=GREY, linestyle=":", label="likeliest")
+    ax.axvline(place.at, color=GREY, linestyle=":", label="most likely position")
     acting, called = _acting(verdict)
     for i, at in enumerate(acting):
         ax.axvline(at, color=COLOURS[0], label="" if i else f"{called} effect")
@@ -201,7 +201,7 @@ def _rank(ax: Axes, verdict: Verdict) -> None:
     ax.set_xticks(ticks, _numbered(ticks))
     ax.xaxis.set_minor_locator(NullLocator())
     for i in np.flatnonzero(below <= ALIKE):
-        text = "as likely" if i else "likeliest"
+        text = "equally likely" if i else "most likely"
         ax.annotate(text, (ALIKE, i), (6, 0), textcoords="offset points", va="center", fontsize=8)
     unseen = [_short(at) for at in acting if all(separation(at, other) > 0 for other in shown)]
     if unseen:
@@ -210,9 +210,9 @@ def _rank(ax: Axes, verdict: Verdict) -> None:
 
 
 def _acting(verdict: Verdict) -> tuple[list[Any], str]:
-    """The places of the verdict's effects, and whether they are "named" or "nearest"."""
+    """The places of the verdict's effects, and whether they are "named" or "best-fitting"."""
     acting = [e.at for e in verdict.effects if e.at is not None and e.kind.path in ("structure", "environment")]
-    return acting, "named" if verdict.outcome == "explained" else "nearest"
+    return acting, "named" if verdict.outcome == "explained" else "best-fitting"
 
 
 def _map(ax: Axes, verdict: Verdict, domain: Rectangle) -> None:
@@ -229,7 +229,7 @@ def _map(ax: Axes, verdict: Verdict, domain: Rectangle) -> None:
     bar.set_ticks(list(ticks), labels=_numbered(ticks))
     acting, called = _acting(verdict)
     look: Any = {"clip_on": False, "zorder": 3, "path_effects": [withStroke(linewidth=4.5, foreground="white")]}
-    ax.plot(*place.at, "+", color=COLOURS[6], markersize=9, markeredgewidth=2, label="likeliest", **look)
+    ax.plot(*place.at, "+", color=COLOURS[6], markersize=9, markeredgewidth=2, label="most likely position", **look)
     look |= {"fillstyle": "none", "markersize": 14, "markeredgewidth": 2}  # around the likeliest, if it is there
     for i, at in enumerate(acting):
         ax.plot(*at, "o", color=COLOURS[1], label="" if i else f"{called} effect", **look)
@@ -289,7 +289,7 @@ def plot_unmodelled_force(verdict: Verdict, *, length: str | None = None, force:
         law = chosen[0].kind.force_laws.get(name) if chosen else None
         if law is not None:  # it depends on this variable alone; beneath the points, which it would otherwise hide
             explains = verdict.outcome == "explained" or any_beyond(verdict.effects)
-            label = "fitted law" if explains else "nearest law: it does not explain the gap"
+            label = "fitted law" if explains else "best-fitting law: it does not explain the gap"
             grid = np.linspace(series.min(), series.max(), 400)
             look = {"color": COLOURS[1], "linewidth": 5.0, "alpha": 0.6, "zorder": 1, "label": label}
             ax.plot(grid, law(chosen[0].values, grid), **look)
@@ -301,7 +301,7 @@ def plot_unmodelled_force(verdict: Verdict, *, length: str | None = None, force:
 def plot_single_effects(verdict: Verdict) -> Figure:
     """The residual of each effect alone, and of a law beyond the catalogue if one explains the gap.
 
-    Where channels are exchanged, of each effect beside that exchange.
+    Where channels are exchanged, of each effect with that exchange.
     """
     best = verdict.attribution.best
     beyond = [best] if any_beyond(best.effects) else []
@@ -314,7 +314,7 @@ def plot_single_effects(verdict: Verdict) -> Figure:
     ax.barh(labels[::-1], costs[::-1], color=colours[::-1])
     ax.axvline(1.0, color=COLOURS[2], label="noise floor")
     ax.axvline(verdict.attribution.nominal_cost, color=COLOURS[1], linestyle="--", label="nominal")
-    title = f"best fit of each effect {verdict.attribution.beside}"
+    title = f"best fit of each effect {verdict.attribution.fitted_with}"
     ax.set(xscale="log", xlabel="mean square residual / noise power [-]", title=title)
     ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     return figure

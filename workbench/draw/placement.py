@@ -92,7 +92,7 @@ def plot_places(
         if length is not None:
             outline = 0.5 * (1.0 + CORNERS[[0, 1, 2, 3, 0]]) * np.array(length)
             ax.plot(*outline.T, color=GREY, linewidth=1.0)
-        ax.set(xlabel=units.named("x [m]"), ylabel=units.named("y [m]"), title="places of the actuators")
+        ax.set(xlabel=units.named("x [m]"), ylabel=units.named("y [m]"), title="actuator positions")
         ax.set_aspect("equal")
         ax.legend(**BELOW)
         return figure
@@ -109,7 +109,7 @@ def plot_places(
     if forbidden:
         ax.legend(loc="upper right")
     ax.set_yticks(range(len(rows)), rows)
-    ax.set(xlabel=units.named("x [m]"), ylim=(len(rows) - 0.5, -0.5), title="places of the actuators")
+    ax.set(xlabel=units.named("x [m]"), ylim=(len(rows) - 0.5, -0.5), title="actuator positions")
     return figure
 
 
@@ -257,7 +257,11 @@ def plot_sensor_placement(placement: SensorPlacement) -> Figure:
         else:
             _along(left, placement)
     _errors(right, placement)
-    even = f", at even places {100 * placement.even_error:.2g} %" if np.isfinite(placement.even_error) else ""
+    even = (
+        f", evenly spaced {100 * placement.evenly_spaced_error:.2g} %"
+        if np.isfinite(placement.evenly_spaced_error)
+        else ""
+    )
     found = f"error of the modal coordinates {100 * placement.error:.2g} %"
     figure.suptitle(f"{counted(len(placement.positions), 'sensor')} placed: {found}{even}", x=0.01, ha="left")
     return plain_ticks(figure)
@@ -294,7 +298,7 @@ def _at_points(ax: Axes, placement: SensorPlacement) -> None:
     for at, here in names.items():
         ax.plot(*at, **SENSOR)
         ax.annotate(", ".join(here), (at[0], at[1]), (-9, 5), textcoords="offset points", ha="right")
-    ax.set_title(f"moved in {called}", fontsize=10)
+    ax.set_title(f"deflected in {called}", fontsize=10)
     _legend(ax, *rest_and_moved())
 
 
@@ -316,5 +320,5 @@ def _errors(ax: Axes, placement: SensorPlacement) -> None:
     ax.set(xlabel="mode", ylabel="error of the modal coordinates [%]")
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if most < FEW * errors.min() else (1.0,)))
-    ax.set_title("error that each mode adds", fontsize=10)
+    ax.set_title("contribution of each mode to the error", fontsize=10)
     ax.legend(fontsize=9, ncols=2, columnspacing=1.0, **BELOW)

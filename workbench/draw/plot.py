@@ -97,7 +97,7 @@ plot.register(ModalEstimates, lambda result: plot(result.modes))
 plot.register(Bands, lambda result: plot_surface_bands(result) if result.x.ndim == 2 else plot_bands(result))
 plot.register(Spillover, lambda result: plot_work({"this design": result}))
 plot.register(
-    ControlledModeCount, lambda result: plot_controlled_mode_count({"energy left of this disturbance": result})
+    ControlledModeCount, lambda result: plot_controlled_mode_count({"residual energy after this disturbance": result})
 )
 plot.register(Distortion, lambda result: plot_distortion([result]))
 
@@ -120,7 +120,7 @@ def _(result: ModalFilter) -> Figure:
     where = result.positions if along else 1 + np.arange(len(result.positions))
     for r, weights in enumerate(result.displacement):
         ax.plot(where, weights, "o-" if along else "o", label=f"mode {r + 1}")
-    ax.set(xlabel="x of the sensor [m]" if along else "sensor", ylabel="weight of its displacement [√kg]")
+    ax.set(xlabel="x of the sensor [m]" if along else "sensor", ylabel="coefficient of its displacement [√kg]")
     ax.set_title("modal filter")
     ax.legend(ncols=2)
     return figure

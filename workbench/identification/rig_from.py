@@ -192,7 +192,7 @@ def _shapes_of_residues(
         worst = int(np.argmin(at_out[:, pair[0]] * at_in[:, pair[1]]))
         raise ValueError(
             f"mode {worst + 1} at {modes.frequencies_hz[worst]:.4g} Hz has a negative mass at the driving point"
-            f" ({into[pair[1]].name}, {out[pair[0]].name}): is a sensor turned round, or is the mode noise?"
+            f" ({into[pair[1]].name}, {out[pair[0]].name}): is a sensor of reversed polarity, or the mode spurious?"
         )
     if pair is None and masses is None:
         warnings.warn(

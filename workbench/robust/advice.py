@@ -20,7 +20,7 @@ from workbench.robust.relocation import Relocation
 from workbench.robust.steps import GAINED, Step
 from workbench.robust.verification import Verification, interval
 
-MORE_COST = 0.01  # of the present cost: default of `more_cost`
+MAX_COST_INCREASE = 0.01  # of the present cost: default of `max_cost_increase`
 AS_MUCH = "as much"
 
 
@@ -41,8 +41,8 @@ class Redesign:
         criterion: "cost": J = 2 ∫ energy dt + ρ ∫ FᵀF dt, with ρ such that both terms are equal over the controlled
             modes where actuators and sensors are perfect; "settling": J = t + ρ ∫ FᵀF dt with t the settling time of
             the controlled modes, at most that of the test, and ρ such that both terms are equal there.
-        more_cost, more_work: relative increase of the cost J and of the work W that the redesigned controller is
-            allowed over the present one.
+        max_cost_increase, max_work_increase: allowed relative increase of the cost J and of the work W over those of
+            the present controller.
         relocation: better places of the actuators on the corrected structure; None where not known.
         notes: warnings and remarks.
         units: of results, and of signals in a file of the controller.
@@ -61,13 +61,15 @@ class Redesign:
     verification: Verification
     weight: float
     criterion: str = "cost"
-    more_cost: float = MORE_COST
-    more_work: float = np.inf
+    max_cost_increase: float = MAX_COST_INCREASE
+    max_work_increase: float = np.inf
     relocation: Relocation | None = None
     notes: tuple[str, ...] = ()
     units: Units = SI
 
     pays, aim = Renamed("improves"), Renamed("criterion")
+    more_cost, more_work = Renamed("max_cost_increase"), Renamed("max_work_increase")
+    left_undamped = Renamed("spillover_warning")
     promise, figures = Renamed("guarantee"), Renamed("comparison")
     proof, present_proof = Renamed("verification"), Renamed("present_verification")
     possible = Renamed("uncertain_rig")
@@ -116,9 +118,11 @@ class Redesign:
         """Cost and work above what is allowed, in words; empty for none."""
         cost = f"costs {{}} more, {'vibration' if self.criterion == 'cost' else 'time'} and effort taken together"
         texts = cost, "takes {} more work"
-        over = zip(texts, np.array(self._over) - 1.0, ("cost", "work"), (self.more_cost, self.more_work))
+        over = zip(
+            texts, np.array(self._over) - 1.0, ("cost", "work"), (self.max_cost_increase, self.max_work_increase)
+        )
         return ", and ".join(
-            f"{what.format(_percent(more))}: more_{name} = {np.ceil(100.0 * more) / 100.0:g} allows it"
+            f"{what.format(_percent(more))}: max_{name}_increase = {np.ceil(100.0 * more) / 100.0:g} allows it"
             for what, more, name, allowed in over
             if more > allowed
         )
@@ -178,7 +182,7 @@ class Redesign:
             text += f"; redesigned: {self._behaviour(new, '', named=False)}, {self._times('effort')}"
             text += "" if work.startswith(AS_MUCH) else f" and {work}"
         text = f"On the corrected model {text}; stable on {_stable(new)} Monte Carlo samples."
-        return f"{text} {self.left_undamped}".rstrip()
+        return f"{text} {self.spillover_warning}".rstrip()
 
     @property
     def _reason_to_keep(self) -> str:
@@ -267,16 +271,16 @@ class Redesign:
         return f"{AS_MUCH if times == '1' else f'{times} times the'} {what}"
 
     @property
-    def left_undamped(self) -> str:
-        """A warning of the residual mode that keeps less than half of its open-loop damping; empty for none."""
+    def spillover_warning(self) -> str:
+        """A warning where spillover takes more than half of the damping of a residual mode; empty for none."""
         ratios = np.median(self._used.damping, axis=0)
         own = self.loop.modes.zeta[: ratios.size]
         r = int(np.argmin(ratios))
         if r in self.controlled or ratios[r] >= 0.5 * own[r] or self._used.share_stable < 0.5:
             return ""
         return (
-            f"Mode {r + 1}, which is not controlled, keeps {100.0 * ratios[r]:.2g} % damping of {100.0 * own[r]:.2g} %:"
-            " ask for less damping, or control it too."
+            f"Spillover lowers the damping ratio of residual mode {r + 1} from {100.0 * own[r]:.2g} to"
+            f" {100.0 * ratios[r]:.2g} %: specify less damping, or control that mode too."
         )
 
     @property

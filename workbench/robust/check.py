@@ -97,8 +97,8 @@ class PredictionCheck(Printed):
                 f" readings, as much as without any model; {text}."
             )
         if self.holds:
-            return f"The model holds: {text}."
-        return f"The model does not hold: {text}; worst is {' and '.join(self._worst)}."
+            return f"The record is consistent with the model: {text}."
+        return f"The record is not consistent with the model: {text}; worst is {' and '.join(self._worst)}."
 
     @property
     def _worst(self) -> list[str]:

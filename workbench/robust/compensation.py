@@ -20,7 +20,7 @@ from workbench.arrays import Floats
 from workbench.design.estimation.controller import Controller
 from workbench.design.estimation.digital import (
     DigitalController,
-    FrictionForward,
+    FrictionFeedforward,
     Relays,
     modal_states,
     zero_order_hold,
@@ -141,7 +141,7 @@ def compensated(rig: Rig, loop: Loop, sample_time: float, steps: Sequence[str] =
         b, d, estimator = b @ uncoupling, d @ uncoupling, estimator @ uncoupling
     if isinstance(loop.law, OnOffLaw):
         relays = loop.law.relays
-        parts["relays"] = Relays(loop.law.spread, _values(relays, "force"), _values(relays, "dead_band"))
+        parts["relays"] = Relays(loop.law.allocation, _values(relays, "force"), _values(relays, "dead_band"))
     if "friction" in steps:
         parts["friction"] = _friction(rig, loop, forced, estimator, len(a))
     if any(x.crosstalk for x in actuators):
@@ -169,13 +169,13 @@ def _through_crosstalk(
         )
     undone, parts = np.linalg.inv(mix), dict(parts)
     if "relays" in parts:
-        parts["relays"] = replace(parts["relays"], spread=undone @ parts["relays"].spread)
+        parts["relays"] = replace(parts["relays"], allocation=undone @ parts["relays"].allocation)
     else:
         c, d = undone @ c, undone @ d
     if "bias" in parts:
         parts["bias"] = undone @ parts["bias"]
     if parts.get("friction") is not None:
-        parts["friction"] = replace(parts["friction"], push=undone @ parts["friction"].push)
+        parts["friction"] = replace(parts["friction"], gain=undone @ parts["friction"].gain)
     return c, d, e @ mix, parts
 
 
@@ -301,7 +301,7 @@ def _output(loop: Loop, reads: Floats, sensors: Sequence[Sensor], hold: float, r
     )
 
 
-def _friction(rig: Rig, loop: Loop, forced: Floats, estimator: Floats, n_states: int) -> FrictionForward | None:
+def _friction(rig: Rig, loop: Loop, forced: Floats, estimator: Floats, n_states: int) -> FrictionFeedforward | None:
     """Feed-forward commands that cancel the rig's Coulomb friction in the controlled modes; None without friction.
 
     Args:
@@ -320,9 +320,9 @@ def _friction(rig: Rig, loop: Loop, forced: Floats, estimator: Floats, n_states:
         of_reading = shapes @ estimator[n:]
     else:
         of_state[:, n : 2 * n] = shapes
-    push = np.linalg.pinv(forced[n:]) @ shapes.T
-    return FrictionForward(
-        push, of_state, of_reading, _values(frictions, "force"), _values(frictions, "smoothing_speed")
+    gain = np.linalg.pinv(forced[n:]) @ shapes.T
+    return FrictionFeedforward(
+        gain, of_state, of_reading, _values(frictions, "force"), _values(frictions, "smoothing_speed")
     )
 
 

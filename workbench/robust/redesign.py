@@ -15,7 +15,7 @@ from workbench.records.units import SI, Units
 from workbench.renamed import former_arguments
 from workbench.rig.actuators import without_crosstalk
 from workbench.rig.rig import Rig
-from workbench.robust.advice import MORE_COST, Redesign
+from workbench.robust.advice import MAX_COST_INCREASE, Redesign
 from workbench.robust.compensation import Loop, check_rate, compensated
 from workbench.robust.impulse import impulse_test
 from workbench.robust.on_rig import Design, controlled_by, loop_on_rig, redesigned_for
@@ -33,7 +33,7 @@ __all__ = ["CRITERIA", "Redesign", "Step", "force_weight", "redesign"]
 CRITERIA = ("cost", "settling")
 
 
-@former_arguments(aim="criterion", report="progress")
+@former_arguments(aim="criterion", report="progress", more_cost="max_cost_increase", more_work="max_work_increase")
 @one_blas_thread
 def redesign(
     verdict: Verdict | UncertainRig,
@@ -46,8 +46,8 @@ def redesign(
     seed: int = 0,
     placement: bool = True,
     criterion: str | None = None,
-    more_cost: float = MORE_COST,
-    more_work: float = np.inf,
+    max_cost_increase: float = MAX_COST_INCREASE,
+    max_work_increase: float = np.inf,
     units: Units | None = None,
     progress: Callable[[str, float], None] = lambda text, share: None,
 ) -> Redesign:
@@ -70,8 +70,8 @@ def redesign(
         placement: whether to optimise the places of the actuators too.
         criterion: "cost" or "settling", see `Redesign`; by default "cost" for a law that minimises a cost, and
             "settling" for a law by poles or on-off control.
-        more_cost: relative increase of the cost that is allowed where the redesigned controller settles sooner.
-        more_work: relative increase of the work W = Σ_r |W_r| that is allowed; by default any.
+        max_cost_increase: relative increase of the cost that is allowed where the redesigned controller settles sooner.
+        max_work_increase: relative increase of the work W = Σ_r |W_r| that is allowed; by default any.
         units: of the results; by default those of the verdict.
         progress: called with (text, share done).
 
@@ -81,7 +81,7 @@ def redesign(
         TypeError: no verdict, no design, no test, or an argument that is no number.
         ValueError: an impulse outside the structure, no draws, an unknown criterion, or a share below zero.
     """
-    _check_wanted(criterion, more_cost, more_work)
+    _check_wanted(criterion, max_cost_increase, max_work_increase)
     draws, seed = whole(draws, WHAT_DRAWS, least=1), whole(seed, "seed")
     if test is not None:
         check_test(test)
@@ -137,19 +137,19 @@ def redesign(
         verification=new,
         weight=search.weight,
         criterion=search.criterion,
-        more_cost=more_cost,
-        more_work=more_work,
+        max_cost_increase=max_cost_increase,
+        max_work_increase=max_work_increase,
         relocation=moved,
         notes=_notes(uncertain, corrected, draws, as_wanted=search.criterion == wanted),
         units=units,
     )
 
 
-def _check_wanted(criterion: str | None, more_cost: float, more_work: float) -> None:
+def _check_wanted(criterion: str | None, max_cost_increase: float, max_work_increase: float) -> None:
     """Refuse an unknown criterion, or a share that is none."""
     if criterion not in (None, *CRITERIA):
         raise ValueError(f"the criterion is {' or '.join(CRITERIA)}; got {criterion!r}")
-    for name, share in (("more_cost", more_cost), ("more_work", more_work)):
+    for name, share in (("max_cost_increase", max_cost_increase), ("max_work_increase", max_work_increase)):
         if not number(share, name) >= 0:
             raise ValueError(
                 f"{name} is the relative increase allowed over the present controller, 0 or more; got {share:g}"

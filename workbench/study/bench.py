@@ -15,10 +15,10 @@ from jinja2 import Environment
 from workbench.records.units import SI, Units
 from workbench.rig.rig import Rig
 from workbench.structure.domain import NamedPoints
+from workbench.study.design_evaluation import design_from, results_of, setting
 from workbench.study.pages.page import asset, in_script
 from workbench.study.runs.cases import StudyError
 from workbench.study.saved_design import save
-from workbench.study.trying import design_from, results_of, setting
 
 HERE = "127.0.0.1"
 DRAG = "Drag a triangle (actuator), a circle (sensor) or the hammer{}; the arrow keys move them too."

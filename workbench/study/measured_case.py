@@ -64,8 +64,8 @@ def measured_case(
     for path, record in zip((*records, *validation), read_all, strict=True):
         if record.repeats(low):
             raise ValueError(
-                f"{path} holds the same measurement as --nominal {nominal}: the model was learnt from it, so it shows"
-                " no gap; give --nominal a record at low level, and --records and --validation others"
+                f"{path} holds the same measurement as --nominal {nominal}: the model is identified from it, so it"
+                " shows no gap; give --nominal a record at low level, and --records and --validation others"
             )
     rig = _rig_of(identify_driven([low]), pair)
     return Case(nominal.stem, rig, read_all[: len(records)], read_all[len(records) :])

@@ -326,7 +326,7 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
         words = joined_in_words(also)
         blocks.insert(0, block(where, f"{words[:1].upper()}{words[1:]}."))
     numbers = ("W_R [J]", *command_headings(str(content.get("command_unit", "N"))), "condition number of B")
-    headings = ("placement", *map(units.named, (*numbers, "points" if are_points else "places [m]")))
+    headings = ("placement", *map(units.named, (*numbers, "points" if are_points else "positions [m]")))
     return {
         "title": "Actuator placement",
         "lead": lead,

@@ -7,9 +7,9 @@ from pathlib import Path
 from workbench.cases.points import write_points
 from workbench.rig.rig import Rig
 from workbench.structure.domain import NamedPoints, Rectangle
+from workbench.study.design_evaluation import Design, try_out
 from workbench.study.runs.whole_file import write_whole
 from workbench.study.templates import free_path
-from workbench.study.trying import Design, try_out
 
 SCRIPT = '''"""Does the design found on the bench do what the bench showed?"""
 
@@ -19,7 +19,7 @@ import numpy as np
 
 from workbench.cases.nominal import read_rig
 {imports}
-from workbench.study.trying import Design, try_out
+from workbench.study.design_evaluation import Design, try_out
 
 DESIGN = {design}
 SHOWN, STABLE = {shown}, {stable}  # on the bench

@@ -14,7 +14,7 @@ from scipy.io import loadmat
 from scipy.signal import cont2discrete
 
 from workbench.design.estimation.controller import Controller
-from workbench.design.estimation.digital import DigitalController, FrictionForward, Relays, sampled
+from workbench.design.estimation.digital import DigitalController, FrictionFeedforward, Relays, sampled
 from workbench.design.estimation.observers import kalman_controller, luenberger_controller
 from workbench.design.export.export import export, write_controller
 from workbench.design.export.sampled import sample_design
@@ -59,7 +59,7 @@ def everything(rng) -> DigitalController:
         rng.standard_normal((nu, ny)), 0.1 * rng.standard_normal((n, nu)), offset=np.array([0.1, -0.3]),
         scale=np.array([1.1, 0.9]), limit=np.array([2.0, np.inf]), rate=np.array([np.inf, 0.8]),
         dead_zone=np.array([0.0, 0.2]), bias=np.array([0.05, 0.0]),
-        friction=FrictionForward(
+        friction=FrictionFeedforward(
             rng.standard_normal((nu, 1)), rng.standard_normal((1, n)), rng.standard_normal((1, ny)), np.array([0.3]),
             np.array([0.1]),
         ),
@@ -129,10 +129,10 @@ def from_mat(path, readings: np.ndarray) -> np.ndarray:
         y = row["scale"] * (reading - row["offset"])
         w = m["C"] @ z + m["D"] @ y
         if "relay_force" in m:
-            w = -m["relay_spread"] @ (row["relay_force"] * np.sign(w) * (np.abs(w) > row["relay_dead_band"]))
+            w = -m["relay_allocation"] @ (row["relay_force"] * np.sign(w) * (np.abs(w) > row["relay_dead_band"]))
         if "friction_force" in m:
             speed = m["friction_of_state"] @ z + m["friction_of_reading"] @ y
-            w = w + m["friction_push"] @ (m["friction_force"][0] * np.tanh(speed / m["friction_smoothing"][0]))
+            w = w + m["friction_gain"] @ (m["friction_force"][0] * np.tanh(speed / m["friction_smoothing"][0]))
         w = np.minimum(np.maximum(w, -row["limit"]), row["limit"])
         v = np.minimum(np.maximum(w, v - row["rate"]), v + row["rate"])
         commands.append(v + row["dead_zone"] * np.minimum(np.maximum(v / row["onset"], -1), 1) - row["bias"])

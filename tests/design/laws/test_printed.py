@@ -19,7 +19,7 @@ LAW = imsc(MODES, 2, [Actuator("F1", 3.0), Actuator("F2", 6.5)], weight=20.0)
 def test_a_law_prints_its_gains_by_actuator():
     lines = str(LAW).splitlines()
     assert lines[0] == "IMSC, u = -K x: modes 1, 2 by 2 actuators"
-    assert lines[1].split() == ["actuator", "place", "[m]", "q1", "q2", "q1'", "q2'"]
+    assert lines[1].split() == ["actuator", "position", "[m]", "q1", "q2", "q1'", "q2'"]
     assert lines[2].split()[:2] == ["F1", "3"]
     np.testing.assert_allclose([float(k) for k in lines[3].split()[2:]], LAW.gain[1], rtol=1e-3)
     assert repr(LAW) == f"<Law: {lines[0]}>" and "<th>q1&#x27;</th>" in LAW._repr_html_()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from workbench.design.estimation.controller import Controller
-from workbench.design.estimation.digital import DigitalController, FrictionForward, sampled
+from workbench.design.estimation.digital import DigitalController, FrictionFeedforward, sampled
 from workbench.design.estimation.observers import kalman_controller
 from workbench.design.export.sampled_loop import sampled_loop
 from workbench.design.laws.imsc import imsc
@@ -178,7 +178,7 @@ def test_a_fast_loop_comes_to_the_exact_continuous_one(rig):
 def test_the_compiled_controller_is_its_own_step(rig):
     rng = np.random.default_rng(3)
     n = len(rig.sensors)
-    friction = FrictionForward(*(rng.normal(size=s) for s in ((2, 1), (1, 2), (1, n))), np.ones(1), np.full(1, 0.5))
+    friction = FrictionFeedforward(*(rng.normal(size=s) for s in ((2, 1), (1, 2), (1, n))), np.ones(1), np.full(1, 0.5))
     base = restless(rig, 3.0)
     one = replace(
         base, A=0.9 * base.A, E=rng.normal(size=(2, 2)), scale=1 + 0.1 * rng.normal(size=n), limit=np.full(2, 4.0),

@@ -74,7 +74,7 @@ def test_an_unexplained_gap_that_does_not_grow_is_remarked_and_what_is_closed_ha
     near = replace(verdict, effects=(nearest,), shrinkage=replace(verdict.shrinkage, overall=0.29))
     assert near.sentence.endswith("would close 29 % of its rms.")
     assert verdict.where.place.is_single_force is False  # three forces have no place that one could be drawn at
-    assert verdict.location_in_words.startswith("no single point force explains all of the gap; the best, at x = ")
+    assert verdict.location_in_words.startswith("no single point force explains all of the gap; with the best, at x = ")
     case = Case("three", rig, tuple(fit), (check,))
     page = verdict_page(near, case, tmp_path / "three.html", folder=None, made_by="workbench diagnose three")
     assert "single unknown force" in page.read_text() and "reconstructed" not in page.read_text()

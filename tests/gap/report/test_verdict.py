@@ -232,10 +232,10 @@ def test_shares_of_a_set_that_enlarges_a_gap_are_drawn_beyond_the_whole(hinged_r
 
 @pytest.mark.parametrize(
     ("kind", "title"),
-    [("point_mass", "Nearest effects: they do not explain the gap"), ("power_spring", "Effects")],
+    [("point_mass", "Best-fitting effects: they do not explain the gap"), ("power_spring", "Effects")],
 )
 def test_a_nearest_set_is_headed_as_one_that_does_not_explain(kind, title):
-    content = {"effects": [], "nearest": [{"kind": kind, "parameters": {"mass": 1.0}}], "alternatives": []}
+    content = {"effects": [], "best_fit": [{"kind": kind, "parameters": {"mass": 1.0}}], "alternatives": []}
     gap = {"before": {}, "after": {}, "floor": {}}
     assert verdict_tables({**content, "gap": gap})[0][0] == title
 
@@ -250,7 +250,7 @@ def test_the_probability_of_the_set_named_and_of_its_alternatives_sum_to_one(hin
     shown = replace(found, outcome="explained", alternatives=(("a", 0.4),), attribution=search)
     assert shown.probability == pytest.approx(0.6) and shown.to_json()["probability"] == 0.6
     assert found.to_json()["probability"] is None
-    assert dict(verdict_tables(shown.to_json())[-1][2])["the set named"] == 0.6
+    assert dict(verdict_tables(shown.to_json())[-1][2])["selected set"] == 0.6
 
 
 def test_clipping_of_all_sensors_is_one_effect_only_where_their_limits_have_one_unit(hinged_rig, record_of):
@@ -263,7 +263,7 @@ def test_clipping_of_all_sensors_is_one_effect_only_where_their_limits_have_one_
     shown = replace(found, outcome="part", effects=each)
     assert "clipping of a sensor (all: limit 0.025 m)" in shown.sentence
     mixed = (replace(rig.sensors[0], quantity="acceleration"), *rig.sensors[1:])
-    named = replace(shown, nominal=replace(rig, sensors=mixed)).to_json()["nearest"]
+    named = replace(shown, nominal=replace(rig, sensors=mixed)).to_json()["best_fit"]
     assert [(e["output"], e["parameters"]["limit"]) for e in named] == [(f"d{i}", 0.01 * i) for i in (1, 2, 3, 4)]
 
 
@@ -271,7 +271,10 @@ def test_a_single_force_that_leaves_little_beyond_the_noise_is_not_said_to_expla
     rig, rng = hinged_rig(3), np.random.default_rng(5)
     record = record_of(rig, np.repeat(rng.normal(size=40), 10)[None], rng, name="high")
     found = diagnose(rig, (record,), catalogue=(kind_named("actuator_gain"),))
-    told = ((0.99995, "leaves 0.7 % of the gap's rms, more than noise"), (0.97, "leaves 17 % of its rms"))
+    told = (
+        (0.99995, "the residual is 0.7 % of the gap's rms, more than noise"),
+        (0.97, "the residual is 17 % of its rms"),
+    )
     for share, words in told:  # the rms, as of what effects close in the sentence
         place = replace(found.where.place, share=share, is_single_force=False)
         assert replace(found, where=replace(found.where, place=place)).location_in_words.endswith(words)

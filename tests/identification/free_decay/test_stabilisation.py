@@ -26,7 +26,7 @@ def test_travelling_shapes_are_not_counted():
     truth = SampledModes([10.0, 17.0], [0.01, 0.01], shapes, np.linspace(0, 1, 4))
     diagram = stabilise(free_decay(truth, sample_time=0.05, n_samples=400), orders=[2], delays=40)
     assert np.allclose(stable_modes(diagram).modes.omega, [10.0])
-    assert stable_modes(diagram, standing=0.0).modes.n_modes == 2
+    assert stable_modes(diagram, min_phase_collinearity=0.0).modes.n_modes == 2
 
 
 @pytest.mark.parametrize("orders", [[], [0, 2]])

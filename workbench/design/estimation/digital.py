@@ -1,7 +1,7 @@
 """A digital controller: once per sample, from readings to commands, with compensation of actuators and sensors.
 
     y = scale (reading - offset)
-    w = C z + D y + friction feed-forward,          on-off: w = -spread relay(C z + D y)
+    w = C z + D y + friction feed-forward,          on-off: w = -allocation relay(C z + D y)
     v = w within ± limit, and within ± rate of the previous v
     command = v + dead zone in the direction of v - bias
     z ← A z + B y + E v
@@ -28,32 +28,32 @@ ONSET = 0.01  # of a dead zone: |v| over which its inverse rises from zero, so t
 
 @dataclass(frozen=True, eq=False)
 class Relays:
-    """On-off forces: w = -spread k sgn(s) outside the dead band of s.
+    """On-off forces: w = -allocation k sgn(s) outside the dead band of s.
 
     Attributes:
-        spread: (n_actuators, n_relays).
+        allocation: (n_actuators, n_relays).
         force: (n_relays,) k.
         dead_band: (n_relays,).
     """
 
-    spread: np.ndarray
+    allocation: np.ndarray
     force: np.ndarray
     dead_band: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
-class FrictionForward:
-    """Commands that oppose friction: push force tanh(speed / smoothing), the speed estimated as C z + D y.
+class FrictionFeedforward:
+    """Commands that oppose friction: gain · force tanh(speed / smoothing), the speed estimated as C z + D y.
 
     Attributes:
-        push: (n_actuators, n_frictions) command per force of friction.
+        gain: (n_actuators, n_frictions) command per force of friction.
         of_state: (n_frictions, n_states) C.
         of_reading: (n_frictions, n_sensors) D.
         force: (n_frictions,) N.
         smoothing: (n_frictions,) m/s.
     """
 
-    push: np.ndarray
+    gain: np.ndarray
     of_state: np.ndarray
     of_reading: np.ndarray
     force: np.ndarray
@@ -93,7 +93,7 @@ class DigitalController:
     dead_zone: np.ndarray = field(default_factory=lambda: np.zeros(0))
     bias: np.ndarray = field(default_factory=lambda: np.zeros(0))
     relays: Relays | None = None
-    friction: FrictionForward | None = None
+    friction: FrictionFeedforward | None = None
     name: str = "controller"
     states: tuple[str, ...] = ()
 
@@ -128,10 +128,10 @@ class DigitalController:
         w = self.C @ z + self.D @ y
         if self.relays is not None:
             sign = np.where(np.abs(w) > self.relays.dead_band, np.sign(w), 0.0)
-            w = -self.relays.spread @ (self.relays.force * sign)
+            w = -self.relays.allocation @ (self.relays.force * sign)
         if self.friction is not None:
             speed = self.friction.of_state @ z + self.friction.of_reading @ y
-            w = w + self.friction.push @ (self.friction.force * np.tanh(speed / self.friction.smoothing))
+            w = w + self.friction.gain @ (self.friction.force * np.tanh(speed / self.friction.smoothing))
         v = np.clip(np.clip(w, -self.limit, self.limit), before - self.rate, before + self.rate)
         command = v + self.dead_zone * np.clip(v / self.onset, -1.0, 1.0) - self.bias
         return command, v, self.A @ z + self.B @ y + self.E @ v

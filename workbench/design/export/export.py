@@ -104,7 +104,7 @@ def _mat(controller: DigitalController, readings: tuple[str, ...], commands: tup
         "states": np.array(one.states, object),
     }
     if one.relays is not None:
-        content |= {"relay_spread": one.relays.spread, "relay_force": one.relays.force}
+        content |= {"relay_allocation": one.relays.allocation, "relay_force": one.relays.force}
         content |= {"relay_dead_band": one.relays.dead_band}
     if one.friction is not None:
         content |= {f"friction_{name}": getattr(one.friction, name) for name in one.friction.__dataclass_fields__}

@@ -79,10 +79,10 @@ def _numbers(controller: DigitalController) -> tuple[dict[str, Floats], dict[str
     if one.offset.any() or (one.scale != 1).any():
         vectors |= {"SCALE": one.scale, "OFFSET": one.offset}
     if relays is not None:
-        matrices["SPREAD"] = relays.spread
+        matrices["ALLOCATION"] = relays.allocation
         vectors |= {"FORCE": relays.force, "DEAD_BAND": relays.dead_band}
     if friction is not None:
-        matrices |= {"PUSH": friction.push, "SPEED_Y": friction.of_reading}
+        matrices |= {"FRICTION_GAIN": friction.gain, "SPEED_Y": friction.of_reading}
         if len(one.A):
             matrices["SPEED_Z"] = friction.of_state
         vectors |= {"FRICTION": friction.force, "SMOOTHING": friction.smoothing}
@@ -106,9 +106,9 @@ def _equations(matrices: Collection[str], vectors: Collection[str]) -> list[str]
     lines = ["y = SCALE (reading - OFFSET)" if "SCALE" in vectors else "y = reading"]
     lines.append("w = C z + D y" if "C" in matrices else "w = D y")
     if "FORCE" in vectors:
-        lines.append("w <- -SPREAD (FORCE sgn w outside the DEAD_BAND)")
+        lines.append("w <- -ALLOCATION (FORCE sgn w outside the DEAD_BAND)")
     if "FRICTION" in vectors:
-        lines.append("w <- w + PUSH (FRICTION tanh(speed / SMOOTHING)), speed = SPEED_Z z + SPEED_Y y")
+        lines.append("w <- w + FRICTION_GAIN (FRICTION tanh(speed / SMOOTHING)), speed = SPEED_Z z + SPEED_Y y")
     bounds = [text for name, text in (("LIMIT", "+-LIMIT"), ("RATE", "+-RATE of the previous v")) if name in vectors]
     lines.append(f"v = w within {' and '.join(bounds)}" if bounds else "v = w")
     command = "command = v"

@@ -72,7 +72,7 @@ class Law(Printed):
         line = f"{self.name}, u = -K x: mode{'s' * several} {numbered(self.controlled)} by {count} actuator"
         line += "s" * (count > 1)
         modes = [str(r + 1) for r in self.controlled]
-        place = "at" if isinstance(self.actuators[0].at, str) else "place [m]"
+        place = "at" if isinstance(self.actuators[0].at, str) else "position [m]"
         headings = ["actuator", place, *(f"q{r}" for r in modes), *(f"q{r}'" for r in modes)]
         rows = [
             [a.name, place_text(a.at), *(f"{k:.4g}" for k in gains)]

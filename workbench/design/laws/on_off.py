@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from workbench.design.laws.law import DesignError, controlled_indices, participation
+from workbench.renamed import Renamed
 from workbench.rig.actuators import Actuator
 from workbench.structure.modes import Modes, freeze
 
@@ -41,7 +42,7 @@ class OnOffLaw:
 
     Attributes:
         relays: one per controlled mode.
-        spread: (n_actuators, n_controlled) B⁺, from modal forces to actuator forces.
+        allocation: (n_actuators, n_controlled) B⁺, from modal forces to actuator forces.
         controlled: (n_controlled,) zero-based indices.
         actuators: (n_actuators,) driven by the law.
         name: for tables and plots.
@@ -49,14 +50,16 @@ class OnOffLaw:
     """
 
     relays: tuple[Relay, ...]
-    spread: np.ndarray
+    allocation: np.ndarray
     controlled: tuple[int, ...]
     actuators: tuple[Actuator, ...]
     name: str = "on-off"
     designed_by: Callable[[Modes, Sequence[int], Sequence[Actuator]], "OnOffLaw"] | None = None
 
+    spread = Renamed("allocation")
+
     def __post_init__(self) -> None:
-        freeze(self, "spread")
+        freeze(self, "allocation")
 
 
 def on_off(
@@ -104,6 +107,6 @@ def on_off(
         Relay(float(modes.omega[r]), float(c[r]), float(k), float(d), float(s))
         for r, k, d, s in zip(index, *values, strict=True)
     )
-    spread = np.linalg.pinv(participation(modes, index, actuators))
+    allocation = np.linalg.pinv(participation(modes, index, actuators))
     again = partial(on_off, force=force, dead_band=dead_band, slope=slope)
-    return OnOffLaw(relays, spread, index, tuple(actuators), designed_by=again)
+    return OnOffLaw(relays, allocation, index, tuple(actuators), designed_by=again)

@@ -48,7 +48,7 @@ def _commands(
     controller: ControllerArrays, k: int, reading: Floats, z: Floats, z_next: Floats, v: Floats, command: Floats
 ) -> None:
     """One step of a `DigitalController` at sample k: fill its commands, v and next state z."""
-    (a, b, c, d, e), (offset, scale, limit, rate, dead, bias), (spread, on, band), (push, cf, df, force, smooth) = (
+    (a, b, c, d, e), (offset, scale, limit, rate, dead, bias), (allocation, on, band), (push, cf, df, force, smooth) = (
         controller
     )
     nu = limit.size
@@ -59,7 +59,7 @@ def _commands(
         if on.size > 0:
             if abs(s) > band[i]:
                 for j in range(nu):
-                    w[j] -= spread[j, i] * math.copysign(on[i], s)
+                    w[j] -= allocation[j, i] * math.copysign(on[i], s)
         else:
             w[i] = s
     for i in range(force.size):

@@ -50,7 +50,9 @@ def switchings(modes: Modes, law: OnOffLaw, state: np.ndarray, final_time: float
     Raises:
         DesignError: an actuator whose force is not its command times its gain.
     """
-    for actuator, most in zip(law.actuators, np.abs(law.spread) @ [relay.force for relay in law.relays], strict=True):
+    for actuator, most in zip(
+        law.actuators, np.abs(law.allocation) @ [relay.force for relay in law.relays], strict=True
+    ):
         _check_proportional(actuator, float(most))
     return tuple(
         switch(relay, state[r], state[modes.n_modes + r], final_time)
@@ -86,7 +88,7 @@ def motion(
     modal = np.empty((2 * n, time.size))
     force = np.empty((len(law.relays), time.size))
     residual = [r for r in range(n) if r not in law.controlled]
-    coupling = input_matrix(modes, law.actuators)[residual] @ law.spread
+    coupling = input_matrix(modes, law.actuators)[residual] @ law.allocation
     omega, damping = modes.omega[residual, None], c[residual, None]
     position, rate = travel(omega, damping, time, state[residual][:, None], state[n:][residual][:, None], 0.0)
     for j, (relay, r) in enumerate(zip(law.relays, law.controlled, strict=True)):
@@ -106,4 +108,4 @@ def motion(
             rate[:, inside] += coupling[:, [j]] * at[1]
             driven = np.array(travel(omega, damping, segment.end - segment.start, driven[0], driven[1], *course))
     modal[residual], modal[[n + r for r in residual]] = position, rate
-    return Response(time, modal, law.spread @ force, modes)
+    return Response(time, modal, law.allocation @ force, modes)

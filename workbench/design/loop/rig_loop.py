@@ -269,9 +269,9 @@ def _arrays(one: DigitalController) -> ControllerArrays:
     switching = (np.zeros((n_actuators, 0)), np.zeros(0), np.zeros(0))
     forward = (np.zeros((n_actuators, 0)), np.zeros((0, n)), np.zeros((0, n_sensors)), np.zeros(0), np.ones(0))
     if relays is not None:
-        switching = (relays.spread, relays.force, relays.dead_band)
+        switching = (relays.allocation, relays.force, relays.dead_band)
     if friction is not None:
-        forward = (friction.push, friction.of_state, friction.of_reading, friction.force, friction.smoothing)
+        forward = (friction.gain, friction.of_state, friction.of_reading, friction.force, friction.smoothing)
     return tuple(
         tuple(np.array(x, float, order="C") for x in group)
         for group in (

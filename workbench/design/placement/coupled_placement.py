@@ -51,7 +51,9 @@ def place_coupled(
         DesignError: fewer actuators than rigid modes controlled, or limits that no random placement meets.
     """
     if not 1 <= n_controlled < modes.n_modes:
-        raise DesignError(f"{n_controlled} of {modes.n_modes} modes controlled leaves no residual mode to spill into")
+        raise DesignError(
+            f"{n_controlled} of {modes.n_modes} modes controlled leave no residual mode, so there is no spillover"
+        )
     if not weight > 0:
         raise DesignError(f"the control weight R must be positive; got {weight:g}")
     rigid = int((modes.omega[:n_controlled] == 0).sum())

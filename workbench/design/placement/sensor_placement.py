@@ -16,7 +16,7 @@ from scipy.optimize import minimize
 from workbench.design.estimation.modal_filter import filter_of_mass
 from workbench.design.laws.law import DesignError, controlled_indices
 from workbench.design.placement.places import as_places
-from workbench.renamed import former_arguments
+from workbench.renamed import Renamed, former_arguments
 from workbench.structure.domain import Interval, Place, Rectangle, listed, same_place
 from workbench.structure.modes import Modes, freeze
 from workbench.structure.printed import Printed, counted, place_text
@@ -35,8 +35,8 @@ class SensorPlacement(Printed):
     Attributes:
         positions: (n_sensors,) m, increasing; on a surface (n_sensors, 2) m; at named points (n_sensors,) names.
         error: relative, root of Σ (T - I)² e over Σ e of the controlled modes.
-        even_error: the same of evenly spaced sensors; on a surface and at named points, of evenly numbered candidates.
-            Infinite where these make no filter.
+        evenly_spaced_error: the same of evenly spaced sensors; on a surface and at named points, of evenly numbered
+            candidates. Infinite where these make no filter.
         exhaustive: whether every choice of the candidates was tried; else the optimum is local, from several starts.
         modes: of the structure.
         controlled: zero-based indices of the filtered modes.
@@ -45,11 +45,13 @@ class SensorPlacement(Printed):
 
     positions: np.ndarray
     error: float
-    even_error: float
+    evenly_spaced_error: float
     exhaustive: bool
     modes: Modes
     controlled: tuple[int, ...]
     by_mode: np.ndarray
+
+    even_error = Renamed("evenly_spaced_error")
 
     def __post_init__(self) -> None:
         freeze(self, "positions", dtype=None)
@@ -57,7 +59,7 @@ class SensorPlacement(Printed):
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         line = f"{counted(len(self.positions), 'sensor')} placed: error of the filter {self.error:.3g}"
-        line += f", of evenly spaced ones {self.even_error:.3g}"
+        line += f", of evenly spaced ones {self.evenly_spaced_error:.3g}"
         rows = [(str(i + 1), place_text(place)) for i, place in enumerate(self.places)]
         return (
             line,

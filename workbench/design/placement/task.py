@@ -286,7 +286,9 @@ def placement_task(
             probabilities, a time that is not positive, or an actuator with a delay or a lag.
     """
     if not 1 <= n_controlled < modes.n_modes:
-        raise DesignError(f"{n_controlled} of {modes.n_modes} modes controlled leaves no residual mode to spill into")
+        raise DesignError(
+            f"{n_controlled} of {modes.n_modes} modes controlled leave no residual mode, so there is no spillover"
+        )
     check_uncoupled(modes)
     if not final_time > 0:
         raise DesignError(f"the final time must be positive; got {final_time}")

@@ -120,7 +120,7 @@ def spillover_remedies(
     reduction = _smallest(lambda size: excess(replace(start, share=1.0 - size)), 1.0)
     if reduction is not None:
         setting = replace(start, share=1.0 - reduction)
-        remedies.append(remedy("gain", f"gain lowered to {setting.share:.3f} of itself", reduction, setting))
+        remedies.append(remedy("gain", f"gain scaled by {setting.share:.3f}", reduction, setting))
     for kind, movable in (("actuator", _actuators(start)), ("sensor", _sensors(start, domain))):
         best: tuple[float, str, _Setting] | None = None
         for name, where, put in movable:

@@ -472,7 +472,7 @@ def _power_law(element: type, name: str, motion: str, words: str, *, even: bool 
 
 
 POWER_SPRING = _power_law(PowerSpring, "power_spring", "displacement", "a power-law spring")
-EVEN_SPRING = _power_law(EvenSpring, "even_spring", "displacement", "an even power-law spring, to one side,", even=True)
+EVEN_SPRING = _power_law(EvenSpring, "even_spring", "displacement", "an even-order power-law spring", even=True)
 POWER_DAMPER = _power_law(PowerDamper, "power_damper", "velocity", "a power-law damper")
 BEYOND = (POWER_SPRING, EVEN_SPRING, POWER_DAMPER)
 

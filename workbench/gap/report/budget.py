@@ -181,17 +181,17 @@ class Budget:
                 f"The residual is {ratio:.2g} times the model's noise_std or more: more noise than stated, or errors of"
                 " the model that neither effects nor small errors describe."
             )
-        if self.leaves_more_than_noise:
-            return f"What looks like noise is {ratio:.2g} times the model's noise_std; part of it may be of the model."
+        if self.has_unexplained_residual:
+            return f"What looks like noise is {ratio:.2g} times the model's noise_std; part of it may be model error."
         return f"The noise of the sensors is {ratio:.2g} times the model's noise_std."
 
     @property
-    def leaves_more_than_noise(self) -> bool:
+    def has_unexplained_residual(self) -> bool:
         """Whether the unexplained share is larger than that of noise."""
         return self.unexplained > self.noise > 0.0
 
     @property
-    def is_open(self) -> bool:
+    def is_mostly_unexplained(self) -> bool:
         """Whether most of the gap is unexplained."""
         return self.unexplained > MOSTLY
 

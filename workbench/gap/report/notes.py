@@ -92,7 +92,7 @@ def _of_gap(verdict: Verdict) -> Iterator[str]:
         )
     if verdict.attribution.reconstruction.has_several_rates:
         yield "The records have several sample rates, so no random force was sought: bring them to one rate for that."
-    if verdict.outcome == "unknown" and verdict.budget.is_open and verdict.budget.errors:
+    if verdict.outcome == "unknown" and verdict.budget.is_mostly_unexplained and verdict.budget.errors:
         yield "Most of the gap is unexplained, so the fitted sizes of the model's errors are not meaningful."
 
 
@@ -141,7 +141,7 @@ def steady_remainder(rig: Rig, records: Sequence[Record], *, transient: float = 
 
 def _of_residual(budget: Budget, power: float, tolerance: float) -> Iterator[str]:
     """A note on the residual of an explained gap above the noise; power: mean square of the gap."""
-    if budget.leaves_more_than_noise:
+    if budget.has_unexplained_residual:
         rest, times = np.sqrt(budget.unexplained * power), np.sqrt(budget.unexplained / budget.noise)
         below = f"below the tolerance of {100 * tolerance:g} %, so its cause was not searched for"
         why = below if rest < tolerance else "an effect is missing"

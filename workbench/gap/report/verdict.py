@@ -20,7 +20,7 @@ from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.modes import Modes
 from workbench.structure.printed import all_rounded, joined_in_words, rounded
 
-NEAR = 0.05  # of the gap: a set that closes less is not stated as the nearest
+NEAR = 0.05  # of the gap: a set that closes less is not stated as the best fit
 SHOWN = 0.005  # of the gap: smaller shares are not stated
 NEARLY_ALL = 0.99  # of the gap: a single force that explains more lacks only what noise shows
 PROPORTIONAL = 1e-6  # relative: deviation of the shape at a point from a multiple of that at another
@@ -37,7 +37,7 @@ class Verdict:
     Attributes:
         case: name of the case.
         outcome: "none" (no gap beyond noise or a tolerance), "explained", "part" (explained in part) or "unknown".
-        effects: the set that explains the gap; empty for "none"; the nearest set for "part" and "unknown"; includes
+        effects: the set that explains the gap; empty for "none"; the best-fitting set for "part" and "unknown"; with
             errors of the nominal model if they were fitted jointly.
         budget: shares of the gap: of each effect, of errors of the nominal model, of noise, and the unexplained one.
         alternatives: (label of another set that the records do not exclude, probability), most probable first; their
@@ -143,10 +143,12 @@ class Verdict:
         elsewhere = explained and self._acting and not self._agrees(self._acting)
         if place.is_single_force is not False or elsewhere:
             return ""
-        left = f"leaves {_percent(float(np.sqrt(1.0 - place.share)))}"
+        residual = _percent(float(np.sqrt(1.0 - place.share)))
         if place.share > NEARLY_ALL:
-            return f"a single point force, {at}, {left} of the gap's rms, more than noise"
-        return f"no single point force explains all of the gap; the best, {at}, {left} of its rms"
+            return f"with a single point force, {at}, the residual is {residual} of the gap's rms, more than noise"
+        return (
+            f"no single point force explains all of the gap; with the best, {at}, the residual is {residual} of its rms"
+        )
 
     @property
     def nominal_errors(self) -> Effect | None:
@@ -186,12 +188,12 @@ class Verdict:
         else:
             text = "No effect of the catalogue, alone or with another, explains the gap"
             if self.attribution.is_cut:
-                text = "None of the effects tried before the time was spent explains the gap"
+                text = "None of the effects tried before the time limit explains the gap"
             if not any_beyond(self.effects):
                 near = words and (self.shrinkage is None or self.shrinkage.overall >= NEAR)
-                beside = f" beside {self._errors_named}" if self.budget.nominal >= SHOWN else ""
+                beside = f" with {self._errors_named}" if self.budget.nominal >= SHOWN else ""
                 text += (
-                    f"; the nearest, {words}{beside}, would close {closed or 'part of it'}."
+                    f"; the best fit, {words}{beside}, would close {closed or 'part of it'}."
                     if near
                     else f"{self._rest}."
                 )
@@ -250,7 +252,7 @@ class Verdict:
             share = _percent(self.budget.effects.get(varying.label, 0.0))
             parts.append(f"{share} are differences of {varying.parameter} from record to record ({varying.words})")
         if self.budget.nominal >= SHOWN:
-            are = "may be" if self._is_open else "are"
+            are = "may be" if self._is_unexplained else "are"
             parts.append(f"{_percent(self.budget.nominal)} {are} {self._errors_named}")
         if self.budget.unexplained >= SHOWN:
             parts.append(f"{_percent(self.budget.unexplained)} remain unexplained")
@@ -259,14 +261,14 @@ class Verdict:
         return "; " + ", ".join(parts) if parts else ""
 
     @property
-    def _is_open(self) -> bool:
+    def _is_unexplained(self) -> bool:
         """Whether most of the gap is unexplained, so that fitted nominal errors have over-fitted it."""
-        return self.outcome == "unknown" and self.budget.is_open
+        return self.outcome == "unknown" and self.budget.is_mostly_unexplained
 
     @property
     def _errors_named(self) -> str:
         """Nominal errors, such as: small errors of the model (stiffness 0.4 %); no sizes if they are over-fitted."""
-        if self._is_open:
+        if self._is_unexplained:
             return "errors of the model"
         size = "small" if self.budget.errors_are_small else "implausibly large"
         return f"{size} errors of the model{self._errors_in_words}"
@@ -347,7 +349,7 @@ class Verdict:
             "outcome": self.outcome,
             "sentence": self.sentence,
             "effects": effects if self.is_decided else [{"kind": "unknown", "parameters": {}}],
-            "nearest": [] if self.is_decided else effects,
+            "best_fit": [] if self.is_decided else effects,
             "probability": rounded(self.probability) if self.outcome == "explained" else None,
             "alternatives": [
                 {"kind": label, "words": words, "probability": rounded(p)}

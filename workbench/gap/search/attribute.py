@@ -89,11 +89,11 @@ class Attribution:
         return float(np.median(self.noise / self.search.data.noise))
 
     @property
-    def beside(self) -> str:
-        """What each of `singles` was fitted beside, in words."""
+    def fitted_with(self) -> str:
+        """What each of `singles` was fitted jointly with, in words."""
         modes = sum(effect.kind.adds_modes for effect in self.given)
         given = ["the exchange"] * (len(self.given) > modes) + ["the missing modes"] * (modes > 0)
-        return f"beside {' and '.join(given)}" if given else "alone"
+        return f"with {' and '.join(given)}" if given else "alone"
 
     def without(self, *effects: Effect) -> "Attribution":
         """The attribution without some effects; the others are refitted, with new intervals."""

@@ -25,6 +25,7 @@ from workbench.identification.signal.data_quality import of_same_sensors
 from workbench.identification.signal.modal_estimates import normalised_shapes, time_derivatives
 from workbench.identification.signal.searches import check_count
 from workbench.records.record import Record
+from workbench.renamed import former_arguments
 from workbench.structure.modes import SampledModes, mac
 from workbench.threads import one_blas_thread
 
@@ -201,16 +202,21 @@ def stabilise(records: Record | Sequence[Record], *, orders: Sequence[int], dela
     return Stabilisation(tuple(orders), tuple(_modes_of(basis[:, : 2 * n], records[0]) for n in orders))
 
 
-def stable_modes(diagram: Stabilisation, *, standing: float = 0.8) -> StableModes:
+@former_arguments(standing="min_phase_collinearity")
+def stable_modes(diagram: Stabilisation, *, min_phase_collinearity: float = 0.8) -> StableModes:
     """The modes that are stable over the orders of a diagram.
 
     Args:
         diagram: from `stabilise`.
-        standing: least phase collinearity of a shape.
+        min_phase_collinearity: of a shape, in 0 to 1.
     """
     groups: list[list[tuple[SampledModes, int]]] = []
     for modes in diagram.found:
-        keep = (modes.zeta > 0) & (modes.zeta < STABILITY.most_damped) & (modes.phase_collinearity >= standing)
+        keep = (
+            (modes.zeta > 0)
+            & (modes.zeta < STABILITY.most_damped)
+            & (modes.phase_collinearity >= min_phase_collinearity)
+        )
         taken = set()
         # The most collinear shapes are assigned first: a mode precedes poles that split off it.
         for r in sorted(np.flatnonzero(keep).tolist(), key=lambda r: -modes.phase_collinearity[r]):

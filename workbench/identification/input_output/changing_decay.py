@@ -1,4 +1,4 @@
-"""A time- or amplitude-dependent mode as the rival model of several close linear modes in a peak of FRFs.
+"""A time- or amplitude-dependent mode against several close linear modes in a peak of FRFs.
 
 An FRF is the transform of a free decay. The decay of a mode that changes with time, with its amplitude, or between
 averages, is
@@ -21,15 +21,15 @@ from scipy.interpolate import CubicSpline
 
 from workbench.arrays import Floats
 from workbench.identification.free_decay.backbone import POWERS, backbone_integrals
-from workbench.identification.input_output.modal_fit import Fit, regressors, row_weights
-from workbench.identification.input_output.rivals import (
-    RIVALS,
+from workbench.identification.input_output.competing_models import (
+    COMPETING,
     bases_with_changes,
     beyond_linear,
     diverged,
     in_place_of_clusters,
     projected_residual,
 )
+from workbench.identification.input_output.modal_fit import Fit, regressors, row_weights
 from workbench.identification.input_output.spectral_lines import Lines, rows_of_pair
 from workbench.identification.signal.searches import CachedResidual, TimeLimit
 from workbench.structure.modes import mac
@@ -69,18 +69,18 @@ def beside_changing(lines: Lines, fit: Fit, limit: float, time_limit: TimeLimit)
         lines,
         fit,
         alike & within & within[:, None],
-        lambda lines, cluster: _rival_of(lines, fit, cluster, limit),
+        lambda lines, cluster: _alternative_of(lines, fit, cluster, limit),
         time_limit,
     )
 
 
-def _rival_of(lines: Lines, fit: Fit, cluster: np.ndarray, limit: float) -> tuple[Lines, complex] | None:
+def _alternative_of(lines: Lines, fit: Fit, cluster: np.ndarray, limit: float) -> tuple[Lines, complex] | None:
     """`in_place_of_clusters`, for one cluster: the lines beside the changing mode, and its pole."""
     weighted_shape, poles = fit.amplitudes[:, cluster[0]] / fit.noise**2, fit.poles[cluster]
     strength = weighted_shape.conj() @ fit.amplitudes[:, cluster]
-    rates = np.maximum(-poles.real, RIVALS.slowest * lines.resolution)
+    rates = np.maximum(-poles.real, COMPETING.slowest * lines.resolution)
     mean = complex(np.average(-rates + 1j * poles.imag, weights=np.abs(strength) ** 2 / rates))
-    margin = max(RIVALS.about * -mean.real, RIVALS.fewest * lines.resolution)
+    margin = max(COMPETING.about * -mean.real, COMPETING.fewest * lines.resolution)
     near_peak = (lines.omega > poles.imag.min() - margin) & (lines.omega < poles.imag.max() + margin)
     peak = _Peak(lines.only(near_peak, DECAY.smooth), fit, cluster, mean)
     linear = peak.fitted(_linear, [np.r_[poles - mean, strength[1:] / strength[0] * -mean.real] / -mean.real])
@@ -242,8 +242,8 @@ class _Peak:
 
         with np.errstate(over="ignore", invalid="ignore"):
             m = motion(unknowns)
-            steps = RIVALS.slightly * np.eye(unknowns.size)
-            return np.column_stack([m, *((motion(unknowns + step) - m) / RIVALS.slightly for step in steps)])
+            steps = COMPETING.slightly * np.eye(unknowns.size)
+            return np.column_stack([m, *((motion(unknowns + step) - m) / COMPETING.slightly for step in steps)])
 
     def _residual(self, motions: np.ndarray) -> tuple[Floats, Floats]:
         """Residual (n,) and its Jacobian (n, n_unknowns)."""

@@ -1,4 +1,4 @@
-"""A time- or amplitude-dependent mode as the rival model of several close linear modes, for one input and one output.
+"""A time- or amplitude-dependent mode against several close linear modes, for one input and one output.
 
     z' = (λ + Σ_k c_k g_k) z + l u,      g = t, t², t³,  or  r^p, r = |z| over its maximum,
 
@@ -17,15 +17,15 @@ from numba import njit
 from scipy.optimize import least_squares
 
 from workbench.arrays import Floats
-from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.modal_fit import Fit
-from workbench.identification.input_output.noise_spectrum import lines_of
-from workbench.identification.input_output.rivals import (
-    RIVALS,
+from workbench.identification.input_output.competing_models import (
+    COMPETING,
     bases_with_changes,
     beyond_linear,
     diverged,
 )
+from workbench.identification.input_output.known_inputs import KnownInputs
+from workbench.identification.input_output.modal_fit import Fit
+from workbench.identification.input_output.noise_spectrum import lines_of
 from workbench.identification.signal.searches import TimeLimit
 
 
@@ -262,12 +262,12 @@ class _Response:
     def __init__(self, data: KnownInputs, fit: Fit, cluster: np.ndarray, rows: Floats) -> None:
         self.data, self.fit = data, fit
         poles = fit.poles[cluster]
-        rates = np.maximum(-poles.real, RIVALS.slowest * data.resolution)
+        rates = np.maximum(-poles.real, COMPETING.slowest * data.resolution)
         power = np.abs(fit.amplitudes[:, cluster] / fit.noise[:, None]).max(axis=0) ** 2 / rates
         self.pole = complex(np.average(-rates + 1j * poles.imag, weights=power))
         self.rate, self.participation = -self.pole.real, fit.participation[cluster[0]]
         self.cluster = cluster
-        margin = max(RIVALS.about * self.rate, RIVALS.fewest * data.resolution)
+        margin = max(COMPETING.about * self.rate, COMPETING.fewest * data.resolution)
         self.low, self.high = poles.imag.min() - margin, poles.imag.max() + margin
         self.coordinates = self._coordinates(self.pole)
         norms = np.sqrt(sum((np.abs(z) ** 2).sum(axis=0) for z in self.coordinates))

@@ -281,4 +281,4 @@ def delay_remarks(data: KnownInputs) -> tuple[str, ...]:
     """A remark on the inputs that act late."""
     names = data.records[0].input_names
     late = [f"{names[i]} {d:.2f} samples ({d * data.dt:.3g} s)" for i, d in enumerate(data.delays) if d > 0]
-    return (f"inputs act late, by {', '.join(late)}: the model takes the delayed inputs",) if late else ()
+    return (f"inputs act late, by {', '.join(late)}: the model has these delays",) if late else ()

@@ -1,4 +1,4 @@
-"""Detection of a burst in the residual of a record: lost or wrong samples, or a knock.
+"""Detection of a burst in the residual of a record: lost or wrong samples, or an impact.
 
 Where samples are lost, the state of the structure jumps, and the residual decays as its modes do. The residual of a
 nonlinear structure grows with its motion, up to the cube; that is no burst.
@@ -63,6 +63,6 @@ def _burst(record: Record, residual: Floats, noise: Floats) -> tuple[str, ...]:
     begins, ends = edges[first][0], edges[first + BURSTS.together - 1][-1]
     return (
         f"in record {record.name!r} {100 * shares[first]:.0f} % of the residual energy lies from {begins:.4g} to"
-        f" {ends:.4g} s: lost or wrong samples, or a knock? It may look like noise of the inputs, or like"
+        f" {ends:.4g} s: lost or wrong samples, or an unmeasured impact? It may look like noise of the inputs, or like"
         " modes that change; leave that part out",
     )

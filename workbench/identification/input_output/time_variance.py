@@ -23,6 +23,7 @@ from scipy.signal import lfilter
 
 from workbench.arrays import Floats, scaled_inverse
 from workbench.identification.input_output.changing_response import CHANGE_CHECK, in_place_of
+from workbench.identification.input_output.competing_models import in_place_of_clusters, orthonormal_basis
 from workbench.identification.input_output.fit_errors import statistic_of, statistic_of_each
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import (
@@ -36,7 +37,6 @@ from workbench.identification.input_output.modal_fit import (
     row_weights,
     settled,
 )
-from workbench.identification.input_output.rivals import in_place_of_clusters, orthonormal_basis
 from workbench.identification.signal.searches import SELECTION, TimeLimit
 from workbench.structure.modes import mac
 from workbench.structure.printed import mode_text
@@ -113,7 +113,7 @@ def slopes_in_time(data: KnownInputs, fit: Fit, x: Floats) -> tuple[Floats, Floa
 def joined(data: KnownInputs, fit: Fit, time_limit: TimeLimit) -> Fit:
     """The fit with one mode in place of two alike, where a change of the one within the record explains the other.
 
-    With one input and one output the rival models were compared already (`beside_changing`).
+    With one input and one output the competing models were compared already (`beside_changing`).
     """
     if fit.noise.size * data.n_inputs == 1:
         return fit
@@ -141,7 +141,7 @@ def beside_changing(
         linear: see `in_place_of`.
     """
     if fit.noise.size * data.n_inputs == 1:
-        return _beside_rivals(data, fit, limit, time_limit, linear)
+        return _with_competing_models(data, fit, limit, time_limit, linear)
     strength = statistic_of_each(fit)
     participation = fit.participation[:, : data.n_inputs].T
     alike = mac(fit.amplitudes, fit.amplitudes) * mac(participation, participation) > CHANGING.alike
@@ -170,10 +170,10 @@ def beside_changing(
     return data, only(data, fit, ~removed)
 
 
-def _beside_rivals(
+def _with_competing_models(
     data: KnownInputs, fit: Fit, limit: float, time_limit: TimeLimit, linear: list[np.ndarray]
 ) -> tuple[KnownInputs, Fit] | None:
-    """`beside_changing` for one input and one output, where shapes tell nothing: the likelier rival model is kept."""
+    """`beside_changing` for one input and one output, where shapes tell nothing: the likelier model is kept."""
     omega = fit.poles.imag
     close = np.abs(np.subtract.outer(omega, omega)) < CHANGING.reach * omega[:, None]
     rows_of = cache(lambda data: regressors(data, fit.poles, fit.participation))

@@ -408,7 +408,7 @@ class SelfCheck(Printed):
         rows = [(str(r + 1), f"{100 * error:.3g}", f"{agreement:.4f}") for r, (error, agreement) in each]
         if self.refusal:
             return f"identified structure against measurement: {self.refusal}", (), (), ()
-        line = f"identified structure against measurement: frequencies at most {100 * self.worst:.3g} % off"
+        line = f"identified structure against measurement: largest frequency error {100 * self.worst:.3g} %"
         return line, ("mode", "frequency [%]", "MAC"), rows, ()
 
     @property

@@ -383,7 +383,7 @@
   function idle(k) {
     var t = answer.time[k], q = setting.omega.map(function (w, r) {
       var z = setting.zeta[r], ring = w * Math.sqrt(Math.max(0, 1 - z * z));
-      return answer.struck[r] * Math.exp(-z * w * t) * (ring > 0 ? Math.sin(ring * t) / ring : t);
+      return answer.impulse_shape[r] * Math.exp(-z * w * t) * (ring > 0 ? Math.sin(ring * t) / ring : t);
     });
     return setting.shapes.map(function (row) { var w = 0; for (var r = 0; r < row.length; r++) w += row[r] * q[r]; return w; });
   }

@@ -23,7 +23,7 @@ from workbench.structure.printed import counted
 from workbench.study.pages.inputs_at_once import responses_to_inputs
 from workbench.study.pages.page import PageContent, block
 
-HEADINGS = ("channel", "quantity", "smallest", "largest", "mean", "std", "strongest at [Hz]")
+HEADINGS = ("channel", "quantity", "min", "max", "mean", "std", "spectral peaks [Hz]")
 FORCES = re.compile(r"force|hammer|shaker|impulse|excit|input|drive|(^|[^a-z])[fu]\d*$", re.IGNORECASE)
 MOTIONS = re.compile(r"acc|beschl|vib|disp|veloc|geschw|(^|[^a-z])weg", re.IGNORECASE)
 PEAKS = 4  # per channel

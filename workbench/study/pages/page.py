@@ -135,7 +135,7 @@ def checks_of(checks: Sequence[Mapping[str, Any]]) -> list[Table]:
         [c["name"], c["value"], f"{'≥' if c.get('at_least') else '≤'} {_cell(c['limit'])}", bool(c["holds"])]
         for c in checks
     ]
-    return [("Checks", ("what", "value", "limit", ""), rows)] if rows else []
+    return [("Checks", ("quantity", "value", "limit", ""), rows)] if rows else []
 
 
 def tables_of(content: Mapping[str, Any]) -> list[Table]:

@@ -54,14 +54,18 @@ def redesign_page(found: Redesign, path: Path, *, name: str, record: Record, fol
     steps = [(s.name, s.what, s.lost, s.in_new_controller) for s in found.steps]
     tables: list[Table] = [
         ("On the same samples: median (95 % interval)", ("", "present", "redesigned"), _figures(found)),
-        ("Steps", ("step", "what", "loss", "in the new controller"), steps),
+        ("Steps", ("step", "change", "performance loss", "in the new controller"), steps),
     ]
     used = found.verification if found.improves else found.present_verification
     moved = [] if found.relocation is None else [found.relocation.sentence]
     page_content = PageContent(
         title=f"Redesign for {name}",
         lead=f"{found.advice} {found.guarantee}".rstrip(),
-        standing="bad" if used.share_stable < 0.95 else "good" if found.safe and not found.left_undamped else "part",
+        standing="bad"
+        if used.share_stable < 0.95
+        else "good"
+        if found.safe and not found.spillover_warning
+        else "part",
         lines=[found.comparison, *moved, *found.notes],
         blocks=blocks,
         tables=tables,

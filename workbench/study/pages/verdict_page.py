@@ -43,7 +43,7 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
     changed = nominal.n_modes != corrected.n_modes or not np.allclose(nominal.omega, corrected.omega, rtol=1e-6)
     records = (*case.fit, *case.validation)
     better = verdict.shrinkage is None or verdict.shrinkage.overall > 0
-    rigs, fitted = {"nominal": verdict.nominal}, "corrected" if verdict.outcome == "explained" else "nearest"
+    rigs, fitted = {"nominal": verdict.nominal}, "corrected" if verdict.outcome == "explained" else "best fit"
     if verdict.outcome != "none" and better:  # a model that makes the gap larger is not a correction
         rigs[fitted] = verdict.corrected
     blocks = [
@@ -69,7 +69,7 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
             made = "The unmodelled force reconstructed from the records, over the motion at its place."
             blocks.append(block(plot_unmodelled_force(verdict), made))
         if verdict.attribution.singles:  # single effects are not fitted if model errors were fitted from the start
-            beside = verdict.attribution.beside
+            beside = verdict.attribution.fitted_with
             each = (
                 f"Residual with each effect {beside}, without model errors; an effect at the noise floor explains all."
             )
@@ -100,9 +100,9 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
 
 def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
     """The tables of effects, gaps and alternatives of a verdict as JSON; tables without rows are omitted."""
-    nearest = content.get("nearest", [])
-    beyond = {kind.name for kind in BEYOND}.issuperset(effect["kind"] for effect in nearest)
-    title = "Effects" if beyond else "Nearest effects: they do not explain the gap"
+    best_fit = content.get("best_fit", content.get("nearest", []))  # the name in files of earlier versions
+    beyond = {kind.name for kind in BEYOND}.issuperset(effect["kind"] for effect in best_fit)
+    title = "Effects" if beyond else "Best-fitting effects: they do not explain the gap"
     effects = [
         [
             label_in_words(effect["kind"]),
@@ -111,7 +111,7 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
             _place(effect),
             effect.get("input", effect.get("output", "")),
         ]
-        for effect in [*content["effects"], *nearest]
+        for effect in [*content["effects"], *best_fit]
         for name in effect["parameters"]
     ]
     gap, closed = content["gap"], content.get("shrinkage", {})
@@ -120,24 +120,24 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
         [record, *(_in_percent(gap[name].get(record)) for name in GAPS), _in_percent(closed.get(record))]
         for record in gap["before"]
     ]
-    heads = ["record", *GAPS.values(), "share of the rms closed [%]"]
+    heads = ["record", *GAPS.values(), "reduction of the rms [%]"]
     rests = [rest_in_words(gap, record) for record in gap["before"]]
     if any(rests):
-        heads.append("the rest")
+        heads.append("cause of the residual")
         gaps = [[*row, rest] for row, rest in zip(gaps, rests, strict=True)]
-    rivals = [
-        [rival.get("words") or in_words(rival["kind"]), rival["probability"]] for rival in content["alternatives"]
+    alternatives = [
+        [each.get("words") or in_words(each["kind"]), each["probability"]] for each in content["alternatives"]
     ]
-    if rivals and content.get("probability") is not None:
-        rivals.insert(0, ["the set named", content["probability"]])
+    if alternatives and content.get("probability") is not None:
+        alternatives.insert(0, ["selected set", content["probability"]])
     tables = [
         (
             title,
-            ("effect", "parameter", "value", "standard deviation", f"place [{length}]", "input or output"),
+            ("effect", "parameter", "value", "standard deviation", f"position [{length}]", "input or output"),
             effects,
         ),
         ("Gap: rms error / rms signal", heads, gaps),
-        ("Alternatives that the records do not exclude", ("set of effects", "probability"), rivals),
+        ("Alternatives that the records do not exclude", ("set of effects", "probability"), alternatives),
     ]
     return [table for table in tables if table[2]]
 

@@ -1,4 +1,4 @@
-"""A time- or amplitude-dependent mode as the rival model of several close linear modes, in records and in FRFs.
+"""A time- or amplitude-dependent mode against several close linear modes, in records and in FRFs.
 
 To first order, its motion beyond that of a linear mode spans a few columns. Where it is likelier than a cluster of
 close linear modes, these are removed and the columns stay as fixed columns of the measurement.
@@ -31,7 +31,7 @@ from workbench.threads import at_once
 
 
 @dataclass(frozen=True)
-class RivalSettings:
+class CompetingModelSettings:
     """Constants of the comparison of one changing mode with several linear ones."""
 
     near: float = 6.0  # half-power bandwidths: linear modes closer than this may be one changing mode
@@ -48,7 +48,7 @@ class RivalSettings:
     significant: float = 1e-4  # singular value of the columns of a changing mode, above which they count
 
 
-RIVALS = RivalSettings()
+COMPETING = CompetingModelSettings()
 Data = TypeVar("Data", bound=Measurement)
 
 
@@ -56,7 +56,7 @@ def in_place_of_clusters(
     data: Data,
     fit: Fit,
     alike: np.ndarray,
-    rival_of: Callable[[Data, np.ndarray], tuple[Data, complex] | None],
+    alternative_of: Callable[[Data, np.ndarray], tuple[Data, complex] | None],
     time_limit: TimeLimit,
 ) -> tuple[Data, Fit] | None:
     """The measurement with the columns of changing modes, and the fit with one mode for each cluster that one replaces.
@@ -65,8 +65,8 @@ def in_place_of_clusters(
         data: the measurement that `fit` describes.
         fit: of linear modes.
         alike: (n_modes, n_modes) whether two modes may be one, by their shapes.
-        rival_of: the measurement with the columns of a changing mode in place of a cluster of modes, the strongest
-            first, and the pole of the nearest linear mode, rad/s; None where the linear modes are likelier.
+        alternative_of: the measurement with the columns of a changing mode in place of a cluster of modes, the
+            strongest first, and the pole of the nearest linear mode, rad/s; None where the linear modes are likelier.
         time_limit: of time.
 
     Returns:
@@ -75,7 +75,7 @@ def in_place_of_clusters(
     strength = statistic_of_each(fit)
     rates = np.maximum(-fit.poles.real, 0.5 * data.resolution)
     distance = np.abs(np.subtract.outer(fit.poles.imag, fit.poles.imag))
-    close = alike & (distance < RIVALS.near * np.add.outer(rates, rates))
+    close = alike & (distance < COMPETING.near * np.add.outer(rates, rates))
     poles, removed, order = fit.poles.copy(), np.zeros(fit.poles.size, bool), np.argsort(-strength)
 
     def clusters(first: int) -> Iterator[tuple[int, np.ndarray]]:
@@ -83,15 +83,15 @@ def in_place_of_clusters(
         for rank, r in enumerate(order[first:], first):
             others = np.flatnonzero(close[r] & (strength < strength[r]) & ~removed & ~removed[r])
             others = others[np.argsort(distance[r, others])]
-            for k in range(others.size, max(others.size - RIVALS.most_clusters, 0), -1):
+            for k in range(others.size, max(others.size - COMPETING.most_clusters, 0), -1):
                 yield rank, np.r_[r, others[:k]]
 
     tries = clusters(0)
     while (two := list(islice(tries, 2))) and not time_limit.spent("check of modes that change"):
-        rivals = at_once(partial(rival_of, data), [cluster for _, cluster in two])
-        for (rank, cluster), rival in zip(two, rivals, strict=True):
-            if rival is not None:
-                data, poles[cluster[0]] = rival
+        alternatives = at_once(partial(alternative_of, data), [cluster for _, cluster in two])
+        for (rank, cluster), alternative in zip(two, alternatives, strict=True):
+            if alternative is not None:
+                data, poles[cluster[0]] = alternative
                 removed[cluster[1:]] = True
                 tries = clusters(rank + 1)
                 break
@@ -111,7 +111,7 @@ def orthonormal_basis(rows: np.ndarray, least: float) -> Floats:
     basis = np.empty((len(rows), 0))
     while rows.shape[1]:
         squares, directions = np.linalg.eigh(rows.T @ rows)
-        clear = squares > max(least**2, RIVALS.clear**2 * squares[-1])
+        clear = squares > max(least**2, COMPETING.clear**2 * squares[-1])
         if not clear.any():
             break
         basis = np.hstack([basis, orthonormal(rows @ (directions[:, clear] / np.sqrt(squares[clear])))[0]])
@@ -131,9 +131,9 @@ def beyond_linear(data: Measurement, motions: np.ndarray, pole: complex, l_r: np
     """
     pole = _nearest_pole(data, motions[:, 0], pole, l_r)
     linear = np.column_stack([*modal_coordinate(data.responses(pole), l_r), *data.slopes(pole, l_r)])
-    linear = orthonormal_basis(normalised_columns(np.hstack([linear, data.fixed])), RIVALS.collinear)
+    linear = orthonormal_basis(normalised_columns(np.hstack([linear, data.fixed])), COMPETING.collinear)
     motions = normalised_columns(motions)
-    return orthonormal_basis(motions - linear @ (linear.T @ motions), RIVALS.significant), pole
+    return orthonormal_basis(motions - linear @ (linear.T @ motions), COMPETING.significant), pole
 
 
 def bases_with_changes(
@@ -155,7 +155,7 @@ def bases_with_changes(
     bases = []
     for weight, a in zip(weights, np.repeat(fit.amplitudes[:, modes], of_mode // step, axis=1), strict=True):
         each = weight * np.hstack([phi, changes_of(a, (real[:, ::step], imaginary[:, ::step]))])
-        bases.append(orthonormal_basis(normalised_columns(each), RIVALS.collinear))
+        bases.append(orthonormal_basis(normalised_columns(each), COMPETING.collinear))
     return bases
 
 
@@ -190,7 +190,7 @@ def diverged(values: Sequence[Floats], n_unknowns: int) -> Pair:
 def _nearest_pole(data: Measurement, motion: np.ndarray, pole: complex, l_r: np.ndarray) -> complex:
     """Pole of the linear mode, of given participation factors, nearest to a motion (n_rows,) in least squares."""
     rate, best, step, smallest = abs(pole.real), pole, 0j, np.inf
-    for _ in range(RIVALS.most_poles):
+    for _ in range(COMPETING.most_poles):
         trial = best + step
         z = np.column_stack(modal_coordinate(data.responses(trial), l_r))
         size = np.maximum(np.linalg.norm(z, axis=0), 1e-300)
@@ -206,6 +206,6 @@ def _nearest_pole(data: Measurement, motion: np.ndarray, pole: complex, l_r: np.
         else:
             step *= 0.25
         step = min(step.real, -0.5 * best.real) + 1j * step.imag  # keeps the pole stable
-        if abs(step) < RIVALS.same_pole * rate:
+        if abs(step) < COMPETING.same_pole * rate:
             break
     return best

@@ -1,9 +1,9 @@
 import numpy as np
 from scipy.signal import lfilter
 
+from workbench.identification.input_output.competing_models import in_place_of_clusters, orthonormal_basis
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import MANY_ROWS, projected
-from workbench.identification.input_output.rivals import in_place_of_clusters, orthonormal_basis
 from workbench.identification.signal.searches import TimeLimit
 from workbench.records.record import Channel, Record
 
@@ -33,12 +33,12 @@ def test_what_follows_a_changing_mode_is_compared_beside_it():
     fit = projected(data, poles, np.ones((5, 1), complex))
     beside, compared = data.with_distorted((1j,)), []
 
-    def rival_of(measured, cluster):
+    def alternative_of(measured, cluster):
         compared.append((measured, sorted(cluster.tolist())))
         return (beside, poles[cluster[0]] + 1.0) if cluster.size == 2 and 0 in cluster else None
 
     alike = np.abs(np.subtract.outer(hz, hz)) < 5.0
-    found = in_place_of_clusters(data, fit, alike, rival_of, TimeLimit())
+    found = in_place_of_clusters(data, fit, alike, alternative_of, TimeLimit())
     assert found is not None and found[0] is beside
     strongest_pair = compared[1][1]
     kept = np.delete(np.arange(5), [m for m in strongest_pair if m != 0])

@@ -138,12 +138,12 @@ def start(rig: Rig) -> Design:
     if elastic.size == 0:
         raise StudyError("the structure has no elastic mode; compute more modes")
     places = sorted({middle(a.at) for a in rig.actuators if not a.direct}) or [_share(rig, 0.37)]
-    struck = next((a.at for a in rig.actuators if a.direct), _share(rig, 0.63))
+    impulse_at = next((a.at for a in rig.actuators if a.direct), _share(rig, 0.63))
     count = min(len(places), rig.modes.n_modes)
     # R ω_1² = 25 gives the first mode of a plate a damping ratio of about 0.14; the weight of a member is from 5.8
     weight = MEMBER_WEIGHT if isinstance(domain, Interval) else float(f"{WEIGHT_OMEGA_SQUARED / elastic[0] ** 2:.3g}")
     return Design(
-        tuple(places), (), count, (weight,) * count, LAWS[0], cast(Place, struck), float(2.0 * np.pi / elastic[0])
+        tuple(places), (), count, (weight,) * count, LAWS[0], cast(Place, impulse_at), float(2.0 * np.pi / elastic[0])
     )
 
 
@@ -253,7 +253,7 @@ def results_of(rig: Rig, design: Design) -> dict[str, Any]:
         "modal": all_rounded(tried.response.modal[: rig.modes.n_modes, ::step]),
         "energy": all_rounded(energy),
         "forces": all_rounded(tried.response.forces[:, ::step]),
-        "struck": all_rounded(rig.modes.phi(design.impulse_at)[0]),
+        "impulse_shape": all_rounded(rig.modes.phi(design.impulse_at)[0]),
     }
 
 
