@@ -21,7 +21,7 @@ DATA["f16"] = SHARED / "measured/f16"
 LONG = {
     "blind_trials",
     "imperfect_trials",
-    "own_trials",
+    "ideal_trials",
     "false_alarms",
     "many_cases",
     "design_scaling",

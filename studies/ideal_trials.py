@@ -1,4 +1,4 @@
-"""How often does the diagnosis name the hidden effect, in blind trials simulated by finite elements?"""
+"""How often does the diagnosis name the hidden effect where the model is exact but for it, in blind trials?"""
 
 from pathlib import Path
 
@@ -29,9 +29,9 @@ def study(outcome, data: Path | None = None) -> None:
     outcome.check(f"trials of {CASES} that ended in an error", CASES - len(scores), 0)
     for family, limit in (("single", 0.95), ("pair", 0.85), ("unknown", 1.0)):
         right, of = held.shares[family]
-        outcome.check(f"{family}: share named rightly of {of}", right / of, limit, at_least=True)
+        outcome.check(f"{family}: share identified correctly, of {of}", right / of, limit, at_least=True)
     quiet, of = held.shares["none"]
-    outcome.check(f"false alarms in {of} cases that hide nothing", of - quiet, 0)
+    outcome.check(f"false alarms in {of} cases without an effect", of - quiet, 0)
     outcome.check(f"places more than 2 % of the length off, of {held.placed}", held.misplaced, 0)
     closed = sorted(
         one["shrinkage"]["validate"]
@@ -39,4 +39,4 @@ def study(outcome, data: Path | None = None) -> None:
         if one["kinds"] and one["family"] in ("single", "pair") and one["shrinkage"].get("validate") is not None
     )
     outcome.check("median share of the closable gap closed", closed[len(closed) // 2], 0.95, at_least=True)
-    outcome.figure("confusion", plot_confusion(held), "Hidden against named effects, in blind trials.")
+    outcome.figure("confusion", plot_confusion(held), "True against identified effects, in blind trials with a model that is exact but for the effect.")
