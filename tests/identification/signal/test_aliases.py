@@ -32,7 +32,7 @@ def test_the_true_frequency_is_among_the_candidates_and_another_rate_decides(tru
 
 def test_candidates_all_give_the_same_samples():
     modes = SampledModes([2 * np.pi * 13.0], [0.02], [[1.0]], [0.0])
-    found = aliases(modes, sample_rate_hz=100.0, most=5)
+    found = aliases(modes, sample_rate_hz=100.0, n_branches=5)
     for k, f, zeta in zip(found.branches, found.frequencies_hz[:, 0], found.zeta[:, 0]):
         omega = 2 * np.pi * f
         mu = np.exp((-zeta * omega + 1j * omega * np.sqrt(1 - zeta**2)) / 100.0)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from workbench.renamed import former_arguments
 from workbench.structure.modes import SampledModes, frozen
 
 
@@ -37,7 +38,8 @@ class Aliases:
         return float(rates[apart.min(axis=(0, 1)).argmax()])
 
 
-def aliases(modes: SampledModes, *, sample_rate_hz: float, most: int = 4) -> Aliases:
+@former_arguments(most="n_branches")
+def aliases(modes: SampledModes, *, sample_rate_hz: float, n_branches: int = 4) -> Aliases:
     """The frequencies beyond half the sample rate with the same samples as the modes: f_s - f, f_s + f, 2 f_s - f, ...
 
     Samples do not determine the branch. It follows from an anti-alias filter (k = 0), a record at another rate
@@ -46,20 +48,20 @@ def aliases(modes: SampledModes, *, sample_rate_hz: float, most: int = 4) -> Ali
     Args:
         modes: identified below half the sample rate (branch 0).
         sample_rate_hz: of the record.
-        most: number of branches, from k = 0.
+        n_branches: number of branches, from k = 0.
 
     Raises:
         ValueError: modes beyond half the sample rate, or fewer than one branch.
     """
     poles, half = modes.poles, 0.5 * sample_rate_hz
-    if most < 1:
-        raise ValueError(f"at least one branch must be asked for; got {most}")
+    if n_branches < 1:
+        raise ValueError(f"at least one branch must be asked for; got {n_branches}")
     if (poles.imag > 2.0 * np.pi * half).any():
         worst = poles.imag.max() / (2.0 * np.pi)
         raise ValueError(
             f"a mode at {worst:g} Hz lies beyond half the sample rate, {half:g} Hz; give those of branch 0"
         )
-    k = np.arange(most)[:, None]
+    k = np.arange(n_branches)[:, None]
     turns = 2.0 * np.pi * sample_rate_hz * ((k + 1) // 2)
     damped = turns + np.where(k % 2 == 0, 1.0, -1.0) * poles.imag
     omega = np.hypot(poles.real, damped)
