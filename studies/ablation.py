@@ -55,10 +55,7 @@ def trial(case: Path, label: dict, group: str, name: str, factor: float) -> dict
     parts = {"inputs": [part.name for part in rig.actuators], "outputs": [part.name for part in rig.sensors]}
     found = score(verdict, label, domain=rig.modes.domain, **parts)
     right = found["kinds"] and found["channels"] is not False and found["positions"] is not False
-    named = [
-        " of ".join([e["kind"], *(e[transducer] for transducer in ("input", "output") if transducer in e)])
-        for e in verdict["effects"]
-    ]
+    named = [" of ".join([e["kind"], *(e[key] for key in ("input", "output") if key in e)]) for e in verdict["effects"]]
     said = f"{verdict['outcome']}: {' + '.join(sorted(named)) or 'no effect'}"
     return {"verdict": said if right else f"{said} (wrong)"}
 

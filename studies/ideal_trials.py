@@ -39,4 +39,8 @@ def study(outcome, data: Path | None = None) -> None:
         if one["kinds"] and one["family"] in ("single", "pair") and one["shrinkage"].get("validate") is not None
     )
     outcome.check("median share of the closable gap closed", closed[len(closed) // 2], 0.95, at_least=True)
-    outcome.figure("confusion", plot_confusion(held), "True against identified effects, in blind trials with a model that is exact but for the effect.")
+    outcome.figure(
+        "confusion",
+        plot_confusion(held),
+        "True against identified effects, in blind trials with an otherwise exact model.",
+    )

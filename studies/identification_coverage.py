@@ -16,7 +16,7 @@ from workbench.identification.free_decay.ibrahim import stacked_delays
 from workbench.identification.free_decay.refinement import cramer_rao_bound, refine
 from workbench.identification.shapes.bands import eigenfunction_bands
 from workbench.identification.shapes.eigenfunctions import BoundaryConditions
-from workbench.identification.signal.modal_estimates import Refined
+from workbench.identification.signal.modal_estimates import RefinedModes
 from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.structure.member import Beam
 from workbench.structure.modes import SampledModes
@@ -49,7 +49,7 @@ def drawn(truth: SampledModes, *, sample_time: float, n_samples: int, level_db: 
     return refined, cramer_rao_bound(truth, clean, noise_std=noise)
 
 
-def errors(refined: Refined, limit: Refined) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def errors(refined: RefinedModes, limit: RefinedModes) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Errors of frequency, damping and shape over their own standard error, and over the bound's."""
     truth, modes = limit.modes, refined.modes
     columns, k = np.arange(truth.n_modes), np.abs(modes.shapes).argmax(axis=0)

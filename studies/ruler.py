@@ -193,7 +193,7 @@ def _disagreement(rig, kinds, start, bending):
             named = zip(kind.parameters(rig, None), free[1:], strict=True)
             try:
                 changed = kind.apply(rig, None, {p.name: p.from_free(z) for p, z in named})
-            except ValueError:  # a stretch beyond the end of the ruler
+            except ValueError:  # a segment beyond the end of the ruler
                 return np.ones(bending.n_modes)
         return np.exp(free[0]) * changed.modes.frequencies_hz[2:8] / bending.frequencies_hz - 1.0
 

@@ -30,6 +30,9 @@ RENAMED = {
     "validate": "validation",
     "control": "controlled-modes",
     "effort": "effort-ratio",
+    "settle": "transient",
+    "more-cost": "max-cost-increase",
+    "more-work": "max-work-increase",
 }
 
 

@@ -56,8 +56,6 @@ def diagnose(
     transient: Annotated[
         float,
         typer.Option(
-            "--transient",
-            "--settle",
             help="Time at the start of each record that is left out, where it starts in motion, s.",
         ),
     ] = 0.0,

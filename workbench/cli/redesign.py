@@ -54,16 +54,12 @@ def redesign(
     max_cost_increase: Annotated[
         float,
         typer.Option(
-            "--max-cost-increase",
-            "--more-cost",
             help="Share by which a new controller that settles sooner may cost more than the present.",
         ),
     ] = 0.01,
     max_work_increase: Annotated[
         float,
         typer.Option(
-            "--max-work-increase",
-            "--more-work",
             help="Share by which that controller may do more work; unlimited unless given.",
         ),
     ] = float("inf"),

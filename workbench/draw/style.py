@@ -15,7 +15,7 @@ matplotlib.use("Agg")
 # Okabe & Ito's palette, in the order of use
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 GREY = "#8a8a8a"
-MODEL_COLOURS = {"nominal": COLOURS[1], "corrected": COLOURS[0], "nearest": COLOURS[0]}  # of models, in all figures
+MODEL_COLOURS = {"nominal": COLOURS[1], "corrected": COLOURS[0], "best fit": COLOURS[0]}  # of models, in all figures
 MOST_POINTS = 4000  # of a drawn curve; a screen resolves no more
 PLAIN_LEAST, PLAIN_DECADES = 1e-4, 1e6  # least value and widest range of a logarithmic axis with plain numbers
 LEAST_PLAIN = 1e-3  # largest value of an axis below which its unit takes a prefix

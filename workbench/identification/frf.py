@@ -111,6 +111,7 @@ class FrfModes(ParticipatingModes):
     evidence = Renamed("statistic")
 
 
+@former_arguments(transfer="frf")
 def coherence_noise(frf: ArrayLike, coherence: ArrayLike, *, averages: int) -> np.ndarray:
     """Standard error of real and imaginary part of FRFs, |H| ((1 - γ²) / (2 γ² n))^½.
 

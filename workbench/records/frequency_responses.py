@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from workbench.records.confined import load_confined
 from workbench.records.limits import RecordFileError, check_file
 from workbench.records.record import Channel, Record, rows_of
-from workbench.renamed import Renamed
+from workbench.renamed import Renamed, former_arguments
 from workbench.structure.modes import freeze
 from workbench.structure.printed import Printed, counted, place_text
 
@@ -114,6 +114,7 @@ def read_frf(
     return impulse_record(frf.T, sample_rate_hz=float(rate[0]), channels=channels, name=path.stem)
 
 
+@former_arguments(transfer="frf")
 def impulse_record(
     frf: ArrayLike, *, sample_rate_hz: float, channels: tuple[Channel, ...], name: str = "impulse responses"
 ) -> Record:

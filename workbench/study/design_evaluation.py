@@ -29,7 +29,7 @@ from workbench.structure.printed import all_rounded, command_headings, joined_in
 from workbench.study.runs.cases import StudyError
 
 LAWS = ("IMSC", "coupled LQR")
-MOST_PORTS = 40
+MOST_TRANSDUCERS = 40
 LARGEST = 1e100
 N_TIMES, N_FRAMES, N_PLACES, N_CELLS = 2001, 251, 121, 44
 MEMBER_WEIGHT, WEIGHT_OMEGA_SQUARED = 20.0, 25.0
@@ -92,8 +92,8 @@ def design_from(content: Mapping[str, Any]) -> Design:
     if not isinstance(content, Mapping) or set(content) != names:
         raise StudyError(f"a design has {', '.join(sorted(names))}")
     for name in ("actuators", "sensors", "weight"):
-        if not isinstance(content[name], list) or len(content[name]) > MOST_PORTS:
-            raise StudyError(f"{name} is a list of at most {MOST_PORTS} entries")
+        if not isinstance(content[name], list) or len(content[name]) > MOST_TRANSDUCERS:
+            raise StudyError(f"{name} is a list of at most {MOST_TRANSDUCERS} entries")
     places = {name: tuple(_place(v, name) for v in content[name]) for name in ("actuators", "sensors")}
     weight = tuple(_number(v, "weight") for v in content["weight"])
     count = content["controlled"]
@@ -272,7 +272,7 @@ def setting(rig: Rig, units: Units = SI) -> dict[str, Any]:
         **(_frame(rig, domain) if isinstance(domain, NamedPoints) else _field(rig, domain)),
         "omega": all_rounded(rig.modes.omega),
         "zeta": all_rounded(rig.modes.zeta),
-        "most": MOST_PORTS,
+        "most": MOST_TRANSDUCERS,
         "laws": LAWS,
         "design": {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(first).items()},
     }

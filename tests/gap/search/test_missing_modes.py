@@ -64,4 +64,4 @@ def test_a_spring_is_found_beside_modes_that_are_missing():
     assert modes.kind.name == "truncated_modes" and modes.target == 10
     assert spring.kind.name == "ground_spring" and abs(spring.at - hidden["at"]) < 0.03 * LENGTH
     assert abs(spring.values["stiffness"] - hidden["spring"]) < 3.0 * spring.std["stiffness"]
-    assert verdict.attribution.fitted_with == "beside the missing modes" and len(verdict.attribution.singles) > 3
+    assert verdict.attribution.fitted_with == "with the missing modes" and len(verdict.attribution.singles) > 3

@@ -19,11 +19,11 @@ def mass(x):
     return 1.0 + 0.2 * x
 
 
-BREAKDOWN = {"length": LENGTH, "mass_per_length": mass, "attachments": (PointMass(1.3, 0.1), PointSpring(0.7, 3.0))}
+SHARED = {"length": LENGTH, "mass_per_length": mass, "attachments": (PointMass(1.3, 0.1), PointSpring(0.7, 3.0))}
 NOMINAL = {
-    "beam": Beam(bending_stiffness=3.0, left="clamped", right=End(2.0, 0.5), tension=0.4, **BREAKDOWN),
+    "beam": Beam(bending_stiffness=3.0, left="clamped", right=End(2.0, 0.5), tension=0.4, **SHARED),
     "free beam": Beam(length=LENGTH, mass_per_length=mass, bending_stiffness=3.0, left="free", right="free"),
-    "bar": Bar(axial_stiffness=3.0, left="fixed", right="free", **BREAKDOWN),
+    "bar": Bar(axial_stiffness=3.0, left="fixed", right="free", **SHARED),
 }
 
 

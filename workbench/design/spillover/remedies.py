@@ -152,7 +152,7 @@ def sufficient_sensors(
 ) -> tuple[int | None, np.ndarray]:
     """The least number of evenly spaced sensors that stabilises the loop, and the decay rates of 1, 2, … sensors, 1/s.
 
-    The next three numbers of sensors must stabilise it too. The number is None where `max_sensors` do not.
+    The next three numbers of sensors must stabilise it too. None if no number up to `max_sensors` does.
     """
     rates, tolerances = np.full(max_sensors, -np.inf), np.zeros(max_sensors)
     for k in range(1, max_sensors + 1):

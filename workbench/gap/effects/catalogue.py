@@ -25,10 +25,10 @@ from workbench.gap.effects.effect import Kind
 from workbench.gap.effects.environment import KINDS as OF_THE_ENVIRONMENT
 from workbench.gap.effects.nonlinear import KINDS as NONLINEAR
 from workbench.gap.effects.structural import KINDS as STRUCTURAL
-from workbench.gap.effects.transducers import KINDS as OF_PORTS
+from workbench.gap.effects.transducers import KINDS as OF_TRANSDUCERS
 from workbench.structure.printed import joined_in_words
 
-CATALOGUE: tuple[Kind, ...] = (*STRUCTURAL, *NONLINEAR, *OF_PORTS, *OF_THE_ENVIRONMENT)
+CATALOGUE: tuple[Kind, ...] = (*STRUCTURAL, *NONLINEAR, *OF_TRANSDUCERS, *OF_THE_ENVIRONMENT)
 """Every kind of effect that a diagnosis tries, unless it is given others."""
 
 

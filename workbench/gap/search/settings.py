@@ -1,4 +1,4 @@
-"""Constants of the search for effects, one class for each step that reads them, with units and reconstruction."""
+"""Constants of the search for effects, one class for each step that reads them, with units and evidence."""
 
 from dataclasses import dataclass
 

@@ -225,7 +225,7 @@ class Comparison:
         return np.asarray(np.divide(along, over, out=np.ones_like(over), where=over > 0))
 
     def simulated_with(self, rig: Rig, records: Sequence[Record]) -> list[Floats]:
-        """Predictions (n_outputs, n_samples) of another rig for other records, at the samples that are compared."""
+        """Readings (n_outputs, n_samples) of another rig for other records, at the samples that are compared."""
         return _compared_samples(self.measured, [simulated_by(rig, record) for record in records])
 
     def residual_power(self, simulated: Sequence[Floats]) -> Floats:

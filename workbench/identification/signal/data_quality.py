@@ -223,7 +223,7 @@ def dropout_remark(record: Record, after: str, *, before: float = np.inf) -> tup
     if not early:
         return ()
     name, at, count, how = early[0]
-    more = f" (and {len(early) - 1} further ones)" if len(early) > 1 else ""
+    more = f" (and {len(early) - 1} more)" if len(early) > 1 else ""
     return (
         f"in record {record.name!r} output {name!r} {how} for {count} samples from {at:.6g} s on{more}: lost data?"
         f" {after}",

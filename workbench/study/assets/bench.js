@@ -76,13 +76,13 @@
       weights();
       ask();
     });
-    ports("actuators", "actuators");
-    ports("sensors", "sensors (none: exact modes)");
+    transducers("actuators", "actuators");
+    transducers("sensors", "sensors (none: exact modes)");
     var t = row(labels.final_time), time = html("input", { id: "time", type: "number", min: 0, step: "any", value: +design.final_time.toPrecision(4) }, t);
     time.addEventListener("change", function () { if (+time.value > 0) { design.final_time = +time.value; ask(); } });
     weights();
   }
-  function ports(kind, text) {
+  function transducers(kind, text) {
     var label = row(text), reading = html("output", {}, label, design[kind].length);
     [["−", -1], ["+", 1]].forEach(function (way) {
       html("button", { type: "button", "aria-label": (way[1] > 0 ? "add to " : "take from ") + kind }, label, way[0]).addEventListener("click", function () {

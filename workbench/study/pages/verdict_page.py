@@ -69,9 +69,9 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
             made = "The unmodelled force reconstructed from the records, over the motion at its place."
             blocks.append(block(plot_unmodelled_force(verdict), made))
         if verdict.attribution.singles:  # single effects are not fitted if model errors were fitted from the start
-            beside = verdict.attribution.fitted_with
             each = (
-                f"Residual with each effect {beside}, without model errors; an effect at the noise floor explains all."
+                f"Residual of the best fit of each effect {verdict.attribution.fitted_with}, without model errors; an"
+                " effect at the noise floor explains all."
             )
             blocks.append(block(plot_single_effects(verdict), each))
     distortions = _of_lowest_and_highest(records)
