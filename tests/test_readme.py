@@ -83,7 +83,7 @@ ROWS = {
     "two hundred cases": lambda r: _share(r, "single"),
     "the same, two effects": lambda r: _share(r, "pair"),
     "the same, nothing hidden": lambda r: min(_share(r, "none"), _share(r, "unknown")),
-    "115 cases, unseen before": lambda r: next(c["value"] for c in r["checks"] if c["name"] == "share named"),
+    "210 cases of an unseen seed": lambda r: next(c["value"] for c in r["checks"] if c["name"] == "share named"),
     "the same: false alarms in": lambda r: sum(s["false_alarms"] for s in r["by size"].values()),
     "42 cases on plates and frames": lambda r: min(_share(r, "single"), _share(r, "pair")),
     "a hundred simulated plants": lambda r: r["redesign over the design on the true effects, median"]["work"],
