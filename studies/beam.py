@@ -198,18 +198,18 @@ def report_designs(outcome, truth, modes, laws) -> None:
     outcome.table("designs", rows)
     even, coupled, placed = rows
     outcome.say(
-        f"IMSC at 2, 4, 6, 8 leaves W_R = {even['W_R']:.2e} in the residual modes,"
-        f" {100 * even['W_R'] / -even['W_C']:.1f} % of what it takes out of the controlled ones; coupled LQR"
+        f"IMSC at 2, 4, 6, 8: spillover work W_R = {even['W_R']:.2e} in the residual modes,"
+        f" {100 * even['W_R'] / -even['W_C']:.1f} % of the energy extracted from the controlled ones; coupled LQR"
         f" {coupled['W_R']:.2e}: at the nodes of mode 5 the two are one law."
     )
     where = ", ".join(f"{at:.2f}" for at in placed["places"])
-    outcome.say(f"Placed at {where}, the same law leaves {placed['W_R']:.2e} for at most 1.5 times the effort.")
-    outcome.check("placed: W_R over that of even places", placed["W_R"] / even["W_R"], 1.0)
-    outcome.check("placed: effort over that of even places", placed["effort"] / even["effort"], 1.505)
+    outcome.say(f"Placed at {where}, the same law has W_R = {placed['W_R']:.2e} for at most 1.5 times the effort.")
+    outcome.check("placed: W_R over that of evenly spaced positions", placed["W_R"] / even["W_R"], 1.0)
+    outcome.check("placed: effort over that of evenly spaced positions", placed["effort"] / even["effort"], 1.505)
     outcome.figure(
         "work",
         plot_work_linear({row["law"]: row["W_r"] for row in rows}, first=N_CONTROLLED),
-        "Work that each law puts into the modes it does not control, on the true beam.",
+        "Spillover work of each law in the residual modes, on the true beam.",
     )
 
 

@@ -124,11 +124,13 @@ def study(outcome, data=None):
         abs(-works["a"].controlled_work - 0.2484470),
         5e-8,
     )
-    outcome.check("energy balance: work in against energy gained, relative", balance, 1e-9)
+    outcome.check("energy balance: work supplied against energy gained, relative", balance, 1e-9)
     outcome.check("nine sensors: filtered against exact feedback, share of the largest displacement", difference, 0.005)
     ratio = works["c"].residual_work / works["a"].residual_work
-    outcome.say(f"actuators all on the left half (c) spill {ratio:.0f} times the work of the nodes of mode 5 (a)")
-    outcome.say(f"the controlled modes give up {-works['a'].controlled_work:.7f} whatever the places")
+    outcome.say(f"actuators all on the left half (c): {ratio:.0f} times the spillover work of the nodes of mode 5 (a)")
+    outcome.say(
+        f"energy extracted from the controlled modes: {-works['a'].controlled_work:.7f}, wherever the actuators are"
+    )
     labels = {name: ", ".join(f"{x:g}" for x in places) for name, places in PLACES.items()}
     outcome.figure(
         "response",
@@ -143,5 +145,5 @@ def study(outcome, data=None):
     outcome.figure(
         "work",
         plot_work({f"actuators at {labels[n]} m": w for n, w in works.items()}),
-        "Work that control spills into the five residual modes.",
+        "Spillover work in the five residual modes.",
     )

@@ -1,7 +1,7 @@
-"""How often does the diagnosis name what hides on a plate or a frame, in blind trials simulated by finite elements?
+"""How often does the diagnosis name the hidden effect on a plate or a frame, in blind trials by finite elements?
 
 Plates have any of five sets of edges; frames have two or three storeys and are known at every other node alone. Half of
-what hides in a frame at a point acts between two points.
+the effects at a point of a frame act between two points.
 """
 
 from pathlib import Path
@@ -44,10 +44,10 @@ def study(outcome, data: Path | None = None) -> None:
     outcome.check(f"trials of {len(cases)} that ended in an error", len(found) - len(held), 0)
     for family, limit in (("single", 0.95), ("pair", 0.85)):
         right, of = whole.shares[family]
-        outcome.check(f"{family}: share named rightly of {of}", right / of, limit, at_least=True)
+        outcome.check(f"{family}: share identified correctly, of {of}", right / of, limit, at_least=True)
     quiet, of = whole.shares["none"]
-    outcome.check(f"false alarms in {of} cases that hide nothing", of - quiet, 0)
+    outcome.check(f"false alarms in {of} cases without an effect", of - quiet, 0)
     outcome.check(f"places wrong, or more than 2 % of the diagonal off, of {whole.placed}", whole.misplaced, 0)
     outcome.figure(
-        "confusion", plot_confusion(whole), "Hidden against named effects, in blind trials on plates and frames."
+        "confusion", plot_confusion(whole), "True against identified effects, in blind trials on plates and frames."
     )

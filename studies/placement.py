@@ -59,9 +59,9 @@ def study(outcome, data=None):
     outcome.check("CasADi's W_R against the closed form, relative", abs(float(work) / best.residual_work - 1.0), 1e-8)
     outcome.check("CasADi's effort against the closed form, relative", abs(float(effort) / best.effort - 1.0), 1e-8)
     outcome.check("W_R of the optimum over the best of a full grid", best.residual_work / on_grid.residual_work, 1.0)
-    outcome.check("nodes of mode 5 spill nothing into mode 5", nodes.residual_work_by_mode[0], 1e-20)
+    outcome.check("spillover into mode 5 of actuators at its nodes", nodes.residual_work_by_mode[0], 1e-20)
     outcome.say(
-        f"the nodes of mode 5 leave W_R = {nodes.residual_work:.3e}; half as much effort again brings"
+        f"at the nodes of mode 5 W_R = {nodes.residual_work:.3e}; with half as much effort again it is"
         f" {best.residual_work:.3e} at x = {', '.join(f'{x:.2f}' for x in best.positions)}"
     )
     outcome.say(f"none of {tried} placements on a grid does better under the same limits")
@@ -72,7 +72,7 @@ def study(outcome, data=None):
         {k: {"positions": s.positions, "error": s.error, "even": s.evenly_spaced_error} for k, s in sensors.items()},
     )
     outcome.check(
-        "error of a filter's coordinates, sensors placed over even, worst of 4 and 6 sensors",
+        "error of a filter's coordinates, sensors placed over evenly spaced, worst of 4 and 6 sensors",
         max(s.error / s.evenly_spaced_error for s in sensors.values()),
         1.0,
     )
@@ -85,6 +85,6 @@ def study(outcome, data=None):
     outcome.figure(
         "front",
         plot_effort_front(front, {"nodes of mode 5": nodes, "optimum at 1.5 × their effort": best}),
-        "Least spillover at each effort, and where the actuators then stand.",
+        "Least spillover at each effort, and the actuator positions there.",
     )
     assert np.all(np.diff(best.positions) >= SPACING - 1e-6)

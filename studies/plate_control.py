@@ -172,6 +172,4 @@ def study(outcome, data=None):
         "design on identified modes": spillover(undamped, law, at_rest).residual_work_by_mode,
         "on the plate itself": closed,
     }
-    outcome.figure(
-        "work", plot_work_linear(works, first=N_CONTROLLED), "Work that control spills into the residual modes."
-    )
+    outcome.figure("work", plot_work_linear(works, first=N_CONTROLLED), "Spillover work in the residual modes.")

@@ -115,7 +115,7 @@ def study(outcome, data: Path | None = None) -> None:
     outcome.figure(
         "stabilisation",
         stabilisation_diagram(diagram, stayed, BAND_HZ),
-        "Modes found at each order asked for; the lines mark those that stay.",
+        "Stabilisation diagram: modes identified at each order; the lines mark the stable ones.",
     )
     outcome.figure(
         "modes",
@@ -166,7 +166,8 @@ def diagnose_frequencies(outcome, bending, others, beam) -> None:
         f" bending frequencies, most in mode {worst + 1}"
     )
     outcome.say(
-        f"no linear effect alone explains these: the nearest, {best.replace('_', ' ')}, leaves {100 * rms[best]:.2f} %"
+        f"no linear effect alone explains these: the best fit, {best.replace('_', ' ')}, has a residual of"
+        f" {100 * rms[best]:.2f} %"
     )
 
 
@@ -230,5 +231,5 @@ def compare_placements(outcome, bending) -> None:
     outcome.figure(
         "placement",
         placement_on_shapes(modes, named, n_controlled=3),
-        "Three placements on the identified mode shapes, and the work each leaves in the residual modes.",
+        "Three placements on the identified mode shapes, and the spillover work of each.",
     )

@@ -106,7 +106,7 @@ def study(outcome, data=None):
 
     found = spillover_remedies(modes, observed, one, [ACROSS])
     for remedy in found:
-        outcome.say(f"settled by: {remedy.change}; margin then {remedy.decay_rate:.2g} 1/s")
+        outcome.say(f"stabilised by: {remedy.change}; margin then {remedy.decay_rate:.2g} 1/s")
     checked = [explain_spillover(modes, remedy.controller).decay_rate for remedy in found]
     outcome.check("every remedy, recomputed on the full plant: least margin", min(checked), 0.0, at_least=True)
     outcome.check("kinds of remedy found", len(found), 4, at_least=True)
@@ -117,8 +117,8 @@ def study(outcome, data=None):
         counts[name], margins[name] = sufficient_sensors(modes, way, one, max_sensors=24)
         outcome.say(f"{name}: {counts[name] or 'no number up to 24 of'} evenly spaced sensors suffice")
     outcome.say(
-        "an even grid of k sensors takes mode 2(k + 1) - r for mode r, so a filter of displacements alone is cured only"
-        " once the alias of its highest mode lies beyond the plant's"
+        "k evenly spaced sensors alias mode 2(k + 1) - r onto mode r, so the loop with a filter of displacements alone"
+        " is stable only where the alias of its highest mode lies beyond the modes of the plant"
     )
     perfect = close_loop(modes, law(one)).decay_rate
     outcome.check("number of sensors that suffices for the modal filter", counts["modal filter"] or np.inf, 24)
