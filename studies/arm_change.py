@@ -121,7 +121,7 @@ def study(outcome, data: Path) -> None:
     outcome.table("rig", {n: [f, s] for n, f, s in zip(FIGURES, figures, spread, strict=True)})
     remainder = float(np.sqrt(np.mean(rig_fit.fun**2)))
     repeatable = float(resampled(rig_fit.fun**2, np.sqrt)[1])
-    outcome.say(f"before: the rig leaves {remainder:.2f} of {before.outputs.std():.2f} counts rms")
+    outcome.say(f"before: a residual of {remainder:.2f} of {before.outputs.std():.2f} counts rms")
 
     rig = arm(figures)
     rig = replace(rig, sensors=(replace(rig.sensors[0], noise_std=repeatable),))
@@ -138,13 +138,16 @@ def study(outcome, data: Path) -> None:
     outcome.table("verdict", verdict.to_json())
 
     best = left(verdict.corrected, after)
-    rivals = {}
+    alternatives = {}
     for fit in verdict.attribution.singles:
         if fit.effects[0].kind is not verdict.effects[0].kind:
             more = left(fit.effects[0].apply(rig), after) ** 2 - best**2
             low, _ = resampled(more, lambda mean: mean)
-            rivals[fit.labels[0]] = {"more_left": float(more.mean() / np.mean(best**2)), "excluded": bool(low > 0)}
-    outcome.table("single_effects", rivals)
+            alternatives[fit.labels[0]] = {
+                "more_left": float(more.mean() / np.mean(best**2)),
+                "excluded": bool(low > 0),
+            }
+    outcome.table("single_effects", alternatives)
 
     # the mass with the rig's own figures free on both tests at once, so that their doubt is in its interval
     joint = identified((before, after), (*figures, 0.01), at=LENGTH)
@@ -181,7 +184,9 @@ def study(outcome, data: Path) -> None:
     gap = {"before": float(np.std(left(rig, after))), "after": float(best.std()), "rig itself": remainder}
     outcome.table("counts_rms", gap)
     outcome.check("residual on the second test over that on the first", best.std() / remainder, 1.1)
-    outcome.check("rivals alone that cannot be excluded", sum(not r["excluded"] for r in rivals.values()), 0)
+    outcome.check(
+        "alternative single effects that cannot be excluded", sum(not r["excluded"] for r in alternatives.values()), 0
+    )
     law = plain_law("coupled", rig, CONTROLLED, damping=DAMPING)
     control = redesign(verdict, law, placement=False)
     outcome.say(f"a controller designed on the first test: {control.sentence}")
@@ -195,7 +200,7 @@ def study(outcome, data: Path) -> None:
     outcome.figure("response", _plot_responses(before, after, rig, verdict.corrected), "Hub angle over drive.")
     outcome.figure("single_effects", plot_single_effects(verdict), "Each linear effect alone on the second test.")
     shares = [1.0 + excess.mean() / np.mean(joint.fun**2) for excess in more]
-    outcome.figure("place", _plot_place(places, shares, lowest), "Where on the link the mass may stand.")
+    outcome.figure("place", _plot_place(places, shares, lowest), "Where on the link the mass may be.")
     outcome.figure(
         "control", plot_redesign(control), "The controller designed before, and redesigned, on the heavier arm."
     )

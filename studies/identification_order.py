@@ -103,11 +103,11 @@ def study(outcome, data: Path | None = None) -> None:
     outcome.check("recall", recall, 0.98, at_least=True)
     outcome.check("precision", precision, 0.98, at_least=True)
     outcome.say(
-        f"{total['found']} of {total['count']} modes that count are found; {total['false']} of {total['reported']}"
-        f" reported are not there: recall {recall:.4f}, precision {precision:.4f}"
+        f"{total['found']} of {total['count']} detectable modes are identified; {total['false']} of {total['reported']}"
+        f" reported are spurious: recall {recall:.4f}, precision {precision:.4f}"
     )
     outcome.figure(
         "found",
         order_found(rows),
-        "Modes missed and modes reported that are not there, of each of the hundred structures.",
+        "Modes missed and spurious modes, of each of the hundred structures.",
     )

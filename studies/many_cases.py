@@ -1,6 +1,6 @@
 """Does running many cases cost more than a plain loop, and do two cores halve it?
 
-The cases are real: how much a beam's control spills for every weight and place of the actuators. Their speed is
+The cases are real: the spillover work on a beam for every weight and position of the actuators. Their speed is
 measured on cases of 50 ms, cold each time, as ratios to a plain loop over the same function in the same minute.
 """
 

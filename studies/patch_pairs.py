@@ -1,4 +1,4 @@
-"""Where should piezo pairs stand on a beam under direct velocity feedback, and is a published optimum the best?"""
+"""Where should piezo pairs be on a beam under direct velocity feedback, and is a published optimum the best?"""
 
 import numpy as np
 

@@ -78,8 +78,8 @@ def study(outcome, data=None):
             },
         )
         outcome.say(
-            f"{name}: at the effort of the nodes of mode 5 the optimum spills"
-            f" {fronts[name][0].residual_work / nodes[name].residual_work:.0%} of what they do; with half as much again"
+            f"{name}: at the effort of the nodes of mode 5 the optimum has a W_R of"
+            f" {fronts[name][0].residual_work / nodes[name].residual_work:.0%} of theirs; with half as much again"
             f" {fronts[name][4].residual_work / nodes[name].residual_work:.0%}"
         )
         work = np.array([p.residual_work for p in fronts[name]])
@@ -114,8 +114,8 @@ def study(outcome, data=None):
         under = ", under every limit" if more else ""
         outcome.check(f"{n} actuators{under}: gap of the certificate", proof.gap, gap * (1 + 1e-9))
         outcome.say(
-            f"{n} actuator(s){under}: no placement spills less than {1 - proof.gap:.0%} of the optimum, proven on"
-            f" {proof.cells} cells; the nodes of mode {n + 1} spill"
+            f"{n} actuator(s){under}: no placement has less than {1 - proof.gap:.0%} of the least W_R found, by"
+            f" {proof.cells} cells of branch and bound; at the nodes of mode {n + 1} it is"
             f" {rule.residual_work / best.residual_work:.2f} times the optimum"
         )
     outcome.table("certificates", proofs)
@@ -145,8 +145,8 @@ def study(outcome, data=None):
         )
         outcome.say(
             f"coupled LQR with {n} actuators for four modes: W_R = {own.residual_work:.2e}; none of {grid.tried}"
-            f" placements on a grid spills less; between them, if all changes as it does from one to the next, it could"
-            f" fall to {min(grid.lower_bound, own.residual_work) / own.residual_work:.0%} of that, not proven"
+            f" placements on a grid has a lower one; between them, if all changes as it does from one to the next, it"
+            f" could fall to {min(grid.lower_bound, own.residual_work) / own.residual_work:.0%} of that, not proven"
         )
     outcome.table("coupled_lqr_scans", scans)
     state = impulse_state(modes, 6.3)
@@ -174,10 +174,10 @@ def study(outcome, data=None):
         1.0,
     )
     outcome.say(
-        f"coupled LQR placed for itself spills {together.residual_work / best.residual_work:.2g} of what IMSC at its"
-        f" optimum does, for {together.effort / best.effort:.2f} of the effort and"
+        f"coupled LQR placed for itself has {together.residual_work / best.residual_work:.2g} of the W_R of IMSC at its"
+        f" optimum, for {together.effort / best.effort:.2f} of the effort and"
         f" {cost['coupled LQR'] / cost['IMSC']:.2f} of the cost: it need not act on every mode, nor use every actuator"
-        f" (they stand at {', '.join(f'{x:.2f}' for x in together.positions)})"
+        f" (they are at {', '.join(f'{x:.2f}' for x in together.positions)})"
     )
     outcome.figure(
         "front", plot_placement_fronts(fronts, nodes), "Least spillover at each effort, beside the nodes of mode 5."
