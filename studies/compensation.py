@@ -1,4 +1,4 @@
-"""How much of what late, sticking or limited actuators cost does a redesigned controller win back on hidden plants?
+"""How much of what late, sticking or limited actuators cost does a redesigned controller recover on hidden plants?
 
 Performance is the settling time of the controlled modes after an impulse: until their energy stays below a hundredth of
 its peak. What an effect costs is that time under the present controller with the effect, over that without; a loop that
@@ -72,10 +72,10 @@ def plant(index, seed):
         told[name] = {
             "present": _figures(controlled(hidden, found.present)),
             "redesigned": _figures(controlled(hidden, found.redesigned)),
-            "pays": found.improves,
+            "improves": found.improves,
             "steps": [s.name for s in found.steps if s.kept],
         }
-    told["saturation"]["soonest"] = _soonest(real, nominal.present, impulse_input, test, free)
+    told["saturation"]["minimum"] = _minimum_settling(real, nominal.present, impulse_input, test, free)
     return told
 
 
@@ -86,7 +86,7 @@ def _sizes(case, peak):
     return {"delay": LATE * low.sample_time, "dead zone": STICKS * rms, "saturation": LIMIT * peak}
 
 
-def _soonest(real, controller, impulse_input, test, free):
+def _minimum_settling(real, controller, impulse_input, test, free):
     """The least settling time of the controlled modes by any forces within the limit, s; see the top."""
     if free.settling(CONTROLLED) is None:
         return None
@@ -164,7 +164,7 @@ def study(outcome, data: Path | None = None) -> None:
 
 
 def report(outcome, rows):
-    """What each effect costs, and what is won back of it."""
+    """What each effect costs, and what is recovered of it."""
     rows = [row for row in rows if row["without"]["settling"] is not None]
     outcome.table("plants", rows)
     lost = {name: [row for row in rows if _over(row, name, "present") > 1.0 + LOST] for name in EFFECTS}
@@ -173,35 +173,38 @@ def report(outcome, rows):
         won = np.array([_won(row, name) for row in there])
         effort = [row[name]["redesigned"]["effort"] / row["without"]["effort"] for row in there]
         table[name] = {
-            "plants that lose": len(there),
+            "plants slowed": len(there),
             "unstable": sum(not row[name]["present"]["stable"] for row in there),
             "settling over that without, present": float(np.median([_over(row, name, "present") for row in there])),
             "redesigned": float(np.median([_over(row, name, "redesigned") for row in there])),
-            "won back, median": float(np.median(won)),
-            "half or more won back on": int((won >= HALF).sum()),
+            "recovered share, median": float(np.median(won)),
+            "half or more recovered on": int((won >= HALF).sum()),
             "effort over that without": float(np.median(effort)),
-            "redesign pays, whatever it costs": sum(row[name]["pays"] for row in there),
+            "redesign improves, at any cost": sum(row[name]["improves"] for row in there),
         }
-    soonest = [row["saturation"]["soonest"] / row["without"]["settling"] for row in lost["saturation"]]
-    table["saturation"] |= {"soonest of any forces": float(np.median(soonest)), "latest": float(np.max(soonest))}
+    minimum = [row["saturation"]["minimum"] / row["without"]["settling"] for row in lost["saturation"]]
+    table["saturation"] |= {
+        "minimum for any forces, median": float(np.median(minimum)),
+        "minimum for any forces, largest": float(np.max(minimum)),
+    }
     outcome.table("each effect", table)
     outcome.say(
         f"Of {len(rows)} hidden plants "
         + "; ".join(
-            f"a {name} slows {t['plants that lose']} (median {t['settling over that without, present']:.2f} times the"
-            f" settling time), redesigned {t['redesigned']:.2f} times: {100 * t['won back, median']:.0f} % won back,"
-            f" half or more on {t['half or more won back on']}"
+            f"a {name} slows {t['plants slowed']} (median {t['settling over that without, present']:.2f} times the"
+            f" settling time), redesigned {t['redesigned']:.2f} times: {100 * t['recovered share, median']:.0f} %"
+            f" recovered, half or more on {t['half or more recovered on']}"
             for name, t in table.items()
         )
         + f". By no more effort and no more vibration of residual modes than without the limit, forces that know the"
-        f" whole plant would settle it within {np.median(soonest):.2f} times that time, at most {np.max(soonest):.2f}."
+        f" whole plant would settle it within {np.median(minimum):.2f} times that time, at most {np.max(minimum):.2f}."
     )
     for name, t in table.items():
-        share, effort = t["won back, median"], t["effort over that without"]
-        outcome.check(f"{name}: share of the lost settling time won back, median", share, HALF, at_least=True)
+        share, effort = t["recovered share, median"], t["effort over that without"]
+        outcome.check(f"{name}: recovered share of the settling-time loss, median", share, HALF, at_least=True)
         outcome.check(f"{name}: effort of the redesign over that without it, median", effort, DEARER)
-    share = sum(t["half or more won back on"] for t in table.values()) / sum(map(len, lost.values()))
-    outcome.check("share of all losses of which half or more is won back", share, NEARLY_ALL, at_least=True)
+    share = sum(t["half or more recovered on"] for t in table.values()) / sum(map(len, lost.values()))
+    outcome.check("share of all losses of which half or more is recovered", share, NEARLY_ALL, at_least=True)
     unstable = sum(not row[name]["redesigned"]["stable"] for row in rows for name in EFFECTS)
     outcome.check("loops that are unstable when redesigned", unstable, 0)
     caption = "Settling time of the controlled modes of each hidden plant with an effect, over that without it."
@@ -215,7 +218,7 @@ def _over(row, name, controller):
 
 
 def _won(row, name):
-    """Share of the lost time that is won back, at most all of it."""
+    """Share of the lost time that is recovered, at most all of it."""
     present, redesigned = _over(row, name, "present"), _over(row, name, "redesigned")
     return min((present - redesigned) / (present - 1.0), 1.0)
 

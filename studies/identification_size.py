@@ -106,8 +106,8 @@ def many_structures(outcome) -> None:
     outcome.check("precision of sixty records", precision, 0.99, at_least=True)
     outcome.check("error over the bound of sixty records", rms.max(), 1.1)
     outcome.say(
-        f"sixty records of thirty modes: {total['found']} of {total['count']} modes that count are found,"
-        f" {total['false']} of {total['reported']} reported are not there; rms error {rms[0]:.3f} (frequency) and"
+        f"sixty records of thirty modes: {total['found']} of {total['count']} detectable modes are identified,"
+        f" {total['false']} of {total['reported']} reported are spurious; rms error {rms[0]:.3f} (frequency) and"
         f" {rms[1]:.3f} (damping) of the bound"
     )
 
@@ -155,8 +155,8 @@ def study(outcome, data: Path | None = None) -> None:
         row["processor_seconds_over_transforms"] = row["processor_seconds"] / transforms(record)
         rows.append(row)
         outcome.say(
-            f"{row['sensors']} sensors, {row['samples']} samples: {row['found']} of {row['count']} modes that count are"
-            f" found, {row['false']} are not there, in {row['processor_seconds']:.1f} s of processor time"
+            f"{row['sensors']} sensors, {row['samples']} samples: {row['found']} of {row['count']} detectable modes are"
+            f" identified, {row['false']} spurious, in {row['processor_seconds']:.1f} s of processor time"
             f" ({row['seconds']:.1f} s by the clock), {row['processor_seconds_over_transforms']:.0f} times that of one"
             " transform of every output"
         )
@@ -174,7 +174,7 @@ def study(outcome, data: Path | None = None) -> None:
         f" {peak:.2f} GB; the cost grows with the power {slope:.2f} of the samples"
     )
     outcome.check("modes missed at full size", full["count"] - full["found"], 0)
-    outcome.check("modes that are not there at full size", full["false"], 0)
+    outcome.check("spurious modes at full size", full["false"], 0)
     outcome.check("error over the bound at full size", rms.max(), 1.2)
     outcome.check("processor seconds at full size", full["processor_seconds"], 30.0)
     outcome.check("peak of memory, GB", peak, 3.0)
