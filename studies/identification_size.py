@@ -127,8 +127,8 @@ def size_and_errors(rows, errors):
     left.axhline(30.0, color=COLOURS[1], lw=1.2)
     left.annotate("limit at full size: 30 s", (samples[0], 30.0), (0, 4), textcoords="offset points", color=COLOURS[1])
     for row in rows:
-        text, at = f"{row['found']} of {row['count']} modes", (row["samples"], row["processor_seconds"])
-        left.annotate(text, at, (-4, 7), textcoords="offset points", ha="right", fontsize=8.5)
+        text, at = f"{row['found']} of {row['count']}\nmodes", (row["samples"], row["processor_seconds"])
+        left.annotate(text, at, (0, -8), textcoords="offset points", ha="center", va="top", fontsize=8.5)
     left.set_xticks(samples, [f"{n:,}" for n in samples])
     left.set_yticks([1, 3, 10, 30], ["1", "3", "10", "30"])
     left.minorticks_off()
