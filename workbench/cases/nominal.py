@@ -24,7 +24,7 @@ from workbench.cases.tables import (
 )
 from workbench.records.units import split_unit
 from workbench.rig.actuators import Actuator, piezo_patch
-from workbench.rig.rig import Rig, derivative_of
+from workbench.rig.rig import Rig, Transducer, derivative_of
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import NamedPoints, Place, PlaceError
@@ -227,7 +227,7 @@ def _check_transducers(inputs: list[dict[str, Any]], outputs: list[dict[str, Any
             check_keys(entry, (*keys, place), f"[[{key}]] {entry['name']!r}")
 
 
-def _check_place(transducer: Actuator | Sensor, modes: Modes, where: str) -> None:
+def _check_place(transducer: Transducer, modes: Modes, where: str) -> None:
     """Refuse a place outside the structure, or a direction or axis that the structure does not have at this place."""
     try:
         modes.phi_at(transducer.at, derivative_of(transducer), direction=transducer.direction)

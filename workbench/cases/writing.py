@@ -13,8 +13,8 @@ from workbench.cases.points import write_points
 from workbench.records.npz_file import write_arrays
 from workbench.records.units import SI
 from workbench.rig.actuators import Actuator
-from workbench.rig.rig import Rig
-from workbench.rig.sensors import MEASURED, Sensor
+from workbench.rig.rig import Rig, Transducer, derivative_of
+from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import Between, NamedPoints, Patch, middle, position
 from workbench.structure.member import Beam, Structure
@@ -25,7 +25,6 @@ from workbench.structure.supports import NAMED_EDGES, NAMED_ENDS, Edge, End
 
 POINTS = "points.csv"
 Support = TypeVar("Support", End, Edge)
-Transducer = Actuator | Sensor
 
 
 def write_case(case: Case, folder: str | Path) -> Path:
@@ -208,12 +207,9 @@ def _transducers(rig: Rig, *, at: Callable[[Transducer], dict[str, Any]]) -> lis
 
 def _direction(transducer: Transducer) -> dict[str, str]:
     """The key of the direction of a force or motion, or of the axis of a moment or rotation; none if it has none."""
-    turning = (
-        transducer.quantity == "moment" if isinstance(transducer, Actuator) else MEASURED[transducer.quantity][0] == 1
-    )
-    if transducer.direction is None or (
-        not turning and not isinstance(transducer.at, str)
-    ):  # a plate moves along its normal
+    turning = derivative_of(transducer) == 1
+    across = not turning and not isinstance(transducer.at, str)  # a plate moves along its normal
+    if transducer.direction is None or across:
         return {}
     return {"axis" if turning else "direction": transducer.direction}
 

@@ -20,15 +20,17 @@ from workbench.structure.printed import Printed, counted, place_text
 WITHOUT_UNIT = ("gain", "hysteresis_share", "hysteresis_width", "direction")  # the width is in the unit of commands
 KEPT = 8  # rigs in a cache of arrays that all records share
 
+Transducer = Actuator | Sensor
 
-def derivative_of(transducer: Actuator | Sensor) -> int:
+
+def derivative_of(transducer: Transducer) -> int:
     """Order of the shapes' spatial derivative at an actuator or sensor: 1 for a moment or a slope, else 0."""
     return (
         int(transducer.quantity == "moment") if isinstance(transducer, Actuator) else MEASURED[transducer.quantity][0]
     )
 
 
-def shape_of(modes: Modes, transducer: Actuator | Sensor) -> Floats:
+def shape_of(modes: Modes, transducer: Transducer) -> Floats:
     """Mode shapes, or their slopes, at an actuator or a sensor: (n_modes,), without its gain, with its `shape_error`.
 
     Raises:
@@ -41,7 +43,7 @@ def shape_of(modes: Modes, transducer: Actuator | Sensor) -> Floats:
     return shape + _shape_error(transducer, modes.n_modes) if transducer.shape_error else shape
 
 
-def shapes_at(modes: Modes, transducers: Sequence[Actuator | Sensor]) -> Floats:
+def shapes_at(modes: Modes, transducers: Sequence[Transducer]) -> Floats:
     """Mode shapes (n_transducers, n_modes), as of `shape_of`; those of one kind are computed at once."""
     shapes = np.empty((len(transducers), modes.n_modes))
     at_points: dict[tuple[str, str | None], list[int]] = {}
@@ -60,13 +62,13 @@ def shapes_at(modes: Modes, transducers: Sequence[Actuator | Sensor]) -> Floats:
     return shapes
 
 
-def _shape_error(transducer: Actuator | Sensor, n_modes: int) -> Floats:
+def _shape_error(transducer: Transducer, n_modes: int) -> Floats:
     """Errors (n_modes,) of the mode shapes at a transducer; zero for modes beyond those of its `shape_error`."""
     known = transducer.shape_error[:n_modes]
     return np.pad(known, (0, n_modes - len(known)))
 
 
-def _misplaced(transducer: Actuator | Sensor, error: PlaceError) -> PlaceError:
+def _misplaced(transducer: Transducer, error: PlaceError) -> PlaceError:
     what = "actuator" if isinstance(transducer, Actuator) else "sensor"
     return PlaceError(f"{what} {transducer.name}: {error}")
 
@@ -110,7 +112,7 @@ class Rig(Printed):
 
     def _check_places(self) -> None:
         domain = self.modes.domain
-        transducers: tuple[Actuator | Sensor, ...] = (*self.actuators, *self.sensors)
+        transducers: tuple[Transducer, ...] = (*self.actuators, *self.sensors)
         for transducer in transducers:
             try:
                 check_place(domain, transducer.at, derivative_of(transducer), transducer.direction)
@@ -168,7 +170,7 @@ class Rig(Printed):
         return line, headings[:shown], [row[:shown] for row in rows], ()
 
 
-def _properties(transducer: Actuator | Sensor) -> str:
+def _properties(transducer: Transducer) -> str:
     """The properties of an actuator or a sensor that differ from their defaults: delay 0.004 s, gain 0.3, limit 2 N."""
     unit = force_unit(transducer) if isinstance(transducer, Actuator) else QUANTITIES[transducer.quantity]
     units = {"delay": "s", "time_constant": "s", "rate_limit": f"{unit}/s", **dict.fromkeys(WITHOUT_UNIT, "")}

@@ -8,7 +8,7 @@ import numpy as np
 
 from workbench.arrays import Floats
 from workbench.rig.actuators import Actuator, mixing
-from workbench.rig.rig import shape_of
+from workbench.rig.rig import Transducer, shape_of
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.modes import Modes
 from workbench.structure.printed import joined_in_words
@@ -71,7 +71,7 @@ def state_space(modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[S
         ValueError: an actuator or sensor that is not linear (dead zone, limit, bias, rounding) or has a delay, and
             cross-talk from a sensor or an actuator that is not among these.
     """
-    parts: tuple[Actuator | Sensor, ...] = (*actuators, *sensors)
+    parts: tuple[Transducer, ...] = (*actuators, *sensors)
     for part in parts:
         _check_finite_linear(part)
     a, b, c, d, states = modal_plant(modes, actuators, sensors, with_crosstalk=True)
@@ -87,7 +87,7 @@ def state_space(modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[S
     )
 
 
-def _check_finite_linear(part: Actuator | Sensor) -> None:
+def _check_finite_linear(part: Transducer) -> None:
     """Refuse an actuator or a sensor that no finite `StateSpace` represents.
 
     Raises:
@@ -184,7 +184,7 @@ def _named(name: str, size: int) -> list[str]:
 Late = tuple[Floats, Floats, Floats]
 
 
-def lateness(part: Actuator | Sensor, modes: Modes) -> list[tuple[str, Late]]:
+def lateness(part: Transducer, modes: Modes) -> list[tuple[str, Late]]:
     """The delay and the lag of an actuator or a sensor as linear systems: ("delay" or "lag", (A, b, c)) of each."""
     systems: list[tuple[str, Late]] = []
     if part.delay > 0:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Transducer
 from workbench.rig.sensors import Sensor
 from workbench.structure.domain import Between, Interval, Location, NamedPoints, Rectangle, middle
 from workbench.structure.member import Beam, Structure
@@ -202,9 +202,7 @@ def _sensor_crosstalk(scene: Scene, rng: np.random.Generator) -> OfStrength:
 def _moved(side: str, scene: Scene, rng: np.random.Generator) -> Numbers:
     """The draw of a misplaced actuator (side "input") or sensor ("output")."""
     rig, domain = scene.rig, scene.rig.modes.domain
-    transducers: Sequence[Actuator | Sensor] = (
-        rig.sensors if side == "output" else [a for a in rig.actuators if not a.direct]
-    )
+    transducers: Sequence[Transducer] = rig.sensors if side == "output" else [a for a in rig.actuators if not a.direct]
     transducer = transducers[int(rng.integers(len(transducers)))]
     if isinstance(domain, NamedPoints):
         if domain.positions is None:

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from workbench.arrays import Floats
-from workbench.rig.actuators import Actuator
-from workbench.rig.sensors import Sensor
+from workbench.rig.rig import Transducer
 from workbench.structure.domain import Between, centred_at
 from workbench.trials.laws import POINT_LAWS, PointLaw
 from workbench.trials.plant import Plant
@@ -37,7 +36,7 @@ def _law(law: PointLaw, plant: Plant, e: dict[str, Any]) -> Plant:
 def _with_transducers(plant: Plant, side: str, name: str, **changes: Any) -> Plant:
     """The plant with one actuator or sensor changed, or all of them (except hammers) for the name "all"."""
 
-    def meant(transducer: Actuator | Sensor) -> bool:
+    def meant(transducer: Transducer) -> bool:
         return transducer.name == name or (name == "all" and not getattr(transducer, "direct", False))
 
     transducers: Any = tuple(

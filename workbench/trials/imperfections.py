@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from workbench.rig.actuators import Actuator
-from workbench.rig.sensors import Sensor
+from workbench.rig.rig import Transducer
 from workbench.structure.domain import Interval, Location, NamedPoints, Rectangle, centred_at, middle, reach
 from workbench.trials.benches import Bench
 from workbench.trials.plant import Plant
@@ -67,7 +66,7 @@ def with_imperfections(plant: Plant, name: str, size: float, bench: Bench, rng: 
 
 def _with_part(plant: Plant, name: str, size: float, bench: Bench, rng: np.random.Generator) -> Plant:
     actuators, sensors, domain = plant.actuators, plant.sensors, bench.rig.modes.domain
-    transducers: tuple[Actuator | Sensor, ...] = (*actuators, *sensors)
+    transducers: tuple[Transducer, ...] = (*actuators, *sensors)
     n = len(actuators)
     if name == "shape":
         spread = rng.uniform(-1.0, 1.0, bench.rig.modes.n_modes) * DAMPING_SPREAD * size

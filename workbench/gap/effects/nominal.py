@@ -20,7 +20,7 @@ from workbench.gap.effects.structural import (
     solved_once,
 )
 from workbench.rig.actuators import Actuator
-from workbench.rig.rig import Rig, derivative_of, shape_of
+from workbench.rig.rig import Rig, Transducer, derivative_of, shape_of
 from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import NamedPoints, centred_at, middle, reach
@@ -195,7 +195,7 @@ def _each_parameter(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
             high = 0.0 if sensor.name in prior.early else LARGEST_DELAY
             yield with_prior(f"delay_{sensor.name}", prior.delay, DELAY_UNIT, low, high, sensor.name)
     # a transducer, and the sensor that alone reads its errors
-    transducers: list[tuple[Actuator | Sensor, str]] = [
+    transducers: list[tuple[Transducer, str]] = [
         *((actuator, "") for actuator in rig.actuators),
         *((sensor, sensor.name) for sensor in rig.sensors),
     ]
@@ -317,7 +317,7 @@ def _with_errors(rig: Rig, prior: NominalPrior | IdentifiedPrior, values: dict[s
         rig, prior, {name: value for name, value in values.items() if group_of(name) not in OUTSIDE}
     )
     rig = differing(rig, prior.parameter, deviations_of(values))
-    transducers: tuple[Actuator | Sensor, ...] = (*rig.actuators, *rig.sensors)
+    transducers: tuple[Transducer, ...] = (*rig.actuators, *rig.sensors)
     units = _shape_units(rig.modes, transducers) if prior.shape else np.zeros((len(transducers), 0))
     if prior.shape and prior.points:
         rig = replace(rig, modes=_modes_with_errors(rig.modes, transducers, prior.points, values))
@@ -332,7 +332,7 @@ def _with_errors(rig: Rig, prior: NominalPrior | IdentifiedPrior, values: dict[s
 
 
 def _modes_with_errors(
-    modes: Modes, transducers: tuple[Actuator | Sensor, ...], points: tuple[str, ...], values: dict[str, float]
+    modes: Modes, transducers: tuple[Transducer, ...], points: tuple[str, ...], values: dict[str, float]
 ) -> Modes:
     """The modes with errors of their shapes at named points, in units of the rms of each mode at the transducers."""
     errors = np.array([[values.get(name, 0.0) for name in _shape_names(point, modes.n_modes)] for point in points])
@@ -388,7 +388,7 @@ def _changed(transducer: Any, changes: tuple[tuple[str, Any], ...]) -> Any:
     return replace(transducer, **dict(changes))
 
 
-def _place_bounds(rig: Rig, transducer: Actuator | Sensor) -> Floats:
+def _place_bounds(rig: Rig, transducer: Transducer) -> Floats:
     """Lower and upper bounds (2, n_coordinates) of the error of a transducer's place, as shares of the extent."""
     domain = rig.modes.domain
     assert not isinstance(domain, NamedPoints)
@@ -397,7 +397,7 @@ def _place_bounds(rig: Rig, transducer: Actuator | Sensor) -> Floats:
 
 
 @lru_cache(maxsize=64)
-def _shape_units(modes: Modes, transducers: tuple[Actuator | Sensor, ...]) -> Floats:
+def _shape_units(modes: Modes, transducers: tuple[Transducer, ...]) -> Floats:
     """Rms of each mode's displacement or slope over all transducers of the same kind: (n_transducers, n_modes).
 
     Cached: not to be written to.
@@ -410,12 +410,12 @@ def _shape_units(modes: Modes, transducers: tuple[Actuator | Sensor, ...]) -> Fl
     return np.array([rms[kind] for kind in kinds])
 
 
-def _gain_name(transducer: Actuator | Sensor) -> str:
+def _gain_name(transducer: Transducer) -> str:
     """Name of the gain error of a transducer; an actuator and a sensor may have the same name."""
     return f"gain_{_side(transducer)}_{transducer.name}"
 
 
-def _place_names(rig: Rig, transducer: Actuator | Sensor) -> list[str]:
+def _place_names(rig: Rig, transducer: Transducer) -> list[str]:
     """Names of the errors of its place, one a coordinate; none at named points."""
     domain = rig.modes.domain
     coordinates = () if isinstance(domain, NamedPoints) else domain.coordinates
@@ -423,13 +423,13 @@ def _place_names(rig: Rig, transducer: Actuator | Sensor) -> list[str]:
 
 
 @lru_cache(maxsize=1024)
-def _shape_names(at: Actuator | Sensor | str, n_modes: int) -> tuple[str, ...]:
+def _shape_names(at: Transducer | str, n_modes: int) -> tuple[str, ...]:
     """Names of the errors of the mode shapes at a transducer, or at a named point."""
     where = f"in_{at}" if isinstance(at, str) else f"{_side(at)}_{at.name}"
     return tuple(f"shape_{where}_{r}" for r in range(1, n_modes + 1))
 
 
-def _side(transducer: Actuator | Sensor) -> str:
+def _side(transducer: Transducer) -> str:
     """Part of the name of a transducer's errors: of an actuator, or at a sensor."""
     return "of" if isinstance(transducer, Actuator) else "at"
 

@@ -106,11 +106,11 @@ class Search:
         """Whether nonlinear effects cluster at one place: two of one kind, or three of any."""
         point = [effect for effect in effects if effect.kind.nonlinear and effect.at is not None]
 
-        def in_parallel(some: Sequence[Effect]) -> bool:
+        def at_one_place(some: Sequence[Effect]) -> bool:
             return not any(apart(one, other, self.rig.modes.domain) for one, other in combinations(some, 2))
 
-        alike = any(one.kind is other.kind and in_parallel((one, other)) for one, other in combinations(point, 2))
-        return alike or any(in_parallel(three) for three in combinations(point, 3))
+        alike = any(one.kind is other.kind and at_one_place((one, other)) for one, other in combinations(point, 2))
+        return alike or any(at_one_place(three) for three in combinations(point, 3))
 
     def surely_better(self, candidate: Fit, than: float, extra: int) -> bool:
         """Whether the gain in likelihood justifies `extra` more parameters."""
