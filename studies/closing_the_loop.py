@@ -25,7 +25,7 @@ from workbench.trials.controlled import control_plant
 from workbench.trials.make import find_trial_with_plant
 
 PLANTS, SEED = 100, 20302
-SEARCHED = 3  # of these by the whole search; the others are told the kinds, as the blind trials name nearly all
+SEARCHED = 3  # of these by the whole search; the others get the kinds of the label, as the blind trials name nearly all
 KINDS = (
     "actuator_delay", "actuator_lag", "actuator_dead_zone", "actuator_saturation", "actuator_gain", "sensor_gain",
     "modulus_error", "sensor_lag", "point_mass", "ground_spring", "cubic_spring", "coulomb_friction", "modal_damping",
@@ -38,7 +38,7 @@ OFF = (1.2, 1.02)  # factors by which the fit starts beside the truth; the bette
 UNKNOWN = 0.2  # of the readings: what is left unexplained from which a fit is no explanation
 MORE = 1.05  # times the noise: what is left, from which errors of the nominal model are fitted
 WORSE = 0.02
-NO_MORE = 0.01  # of the nominal design's work: where the redesign is asked to do no more
+WORK_MARGIN = 0.01  # increase over the nominal design's work that a redesign with limited work may have
 
 CLASSES = (1.0, 10.0, 100.0)  # %, of the cost above that of the design on the true effects, in the figure
 CONTROLLERS = (("nominal", "nominal design", COLOURS[1]), ("redesigned", "redesign", COLOURS[0]))
@@ -54,7 +54,7 @@ def plant(index, seed, searched=False):
     case, label, real = find_trial_with_plant(
         rng, kinds=kinds, imperfections=IMPERFECTIONS[index % len(IMPERFECTIONS)], size=0.5
     )
-    true = tuple(_effect(told) for told in label["effects"])
+    true = tuple(_effect(labelled) for labelled in label["effects"])
     rig = case.rig
     level = np.max([np.abs(r.outputs).max(axis=1) for r in case.fit], axis=0)
     test = impulse_test(rig, range(CONTROLLED), case.fit[0].sample_time, level=level, seed=index)
@@ -76,31 +76,31 @@ def plant(index, seed, searched=False):
     best = redesign(sure, law, test=test, draws=1, seed=index, placement=False)
     weight = force_weight(best.after, best.controlled)
     impulse_input = next(a for a in rig.actuators if a.direct or a.at == test.impulse_at).name
-    bounded = replace(found, max_work_increase=NO_MORE)
+    bounded = replace(found, max_work_increase=WORK_MARGIN)
     used = {
         "nominal": found.present,
         "redesigned": found.controller,
         "true": best.controller,
-        "no more work": bounded.controller,
+        "work limited": bounded.controller,
     }
     given = {"n_samples": test.n_samples, "impulse_input": impulse_input, "impulse": test.impulse}
-    runs, told = {}, {}  # a controller that two of them are runs once
+    runs, results = {}, {}  # equal controllers run once
     for name, controller in used.items():
         if controller not in runs:
             noise_drawn = np.random.default_rng([seed, index, 7])
             runs[controller] = control_plant(real, controller, **given, rng=noise_drawn)
         run = runs[controller]
-        told[name] = {
+        results[name] = {
             "stable": run.stable,
             "work": float(np.abs(run.work).sum()),
-            "work put in": float(np.maximum(run.work, 0.0).sum()),
+            "energy supplied": float(np.maximum(run.work, 0.0).sum()),
             "vibration": run.vibration,
             "effort": run.effort,
             "cost": 2.0 * run.vibration + weight * run.effort,
             "peak force": run.peak_force,
             "settling": run.settling(),
         }
-    told["inside the bands"] = _inside(uncertain, noise, found.controller, test, runs[found.controller])
+    results["inside the bands"] = _inside(uncertain, noise, found.controller, test, runs[found.controller])
     return {
         "kinds": [e.kind.name for e in true],
         "imperfections": label["class"],
@@ -108,11 +108,11 @@ def plant(index, seed, searched=False):
         "unexplained": uncertain.unexplained,
         "stable draws": found.verification.share_stable,
         "safe": found.safe,
-        "pays": found.improves,
-        "pays, no more work": bounded.improves,
+        "improves": found.improves,
+        "improves, work limited": bounded.improves,
         "steps": [s.name for s in found.steps if s.kept] if found.improves else [],
         "sentence": found.sentence,
-        **told,
+        **results,
     }
 
 
@@ -120,14 +120,14 @@ def _inside(uncertain, noise, controller, test, run):
     """Share of the readings of the hidden plant inside the bands that were predicted for them."""
     if not run.stable:
         return None
-    told = predict_loop(uncertain, controller, test, noise_std=noise, draws=PREDICTED, seed=1)
-    return float(told.coverage(run.outputs)[:, 0].mean())
+    predicted = predict_loop(uncertain, controller, test, noise_std=noise, draws=PREDICTED, seed=1)
+    return float(predicted.coverage(run.outputs)[:, 0].mean())
 
 
-def _effect(told):
-    kind = kind_named(told["kind"])
-    target = told.get("input", told.get("output"))
-    return Effect(kind, target, {k: v for k, v in told.items() if k not in ("kind", "input", "output", "at_std")})
+def _effect(labelled):
+    kind = kind_named(labelled["kind"])
+    target = labelled.get("input", labelled.get("output"))
+    return Effect(kind, target, {k: v for k, v in labelled.items() if k not in ("kind", "input", "output", "at_std")})
 
 
 def _size(rig, effects):
@@ -169,7 +169,7 @@ def _beside(effect, rig, off):
 
 def study(outcome, data: Path | None = None) -> None:
     points = [{"index": i, "seed": SEED, "searched": i >= PLANTS - SEARCHED} for i in range(PLANTS)]
-    rows = [dict(r.values) for r in outcome.run(points, plant) if _told(outcome, r)]
+    rows = [dict(r.values) for r in outcome.run(points, plant) if _has_ended(outcome, r)]
     outcome.table("plants", [{k: v for k, v in row.items() if k not in ("sentence", "found")} for row in rows])
     report(outcome, rows)
 
@@ -186,8 +186,8 @@ def report(outcome, rows):
     worse, harder = (
         np.array([row["redesigned"][name] / row["nominal"][name] for row in before]) for name in ("cost", "work")
     )
-    within = [row for row in rows if row["nominal"]["stable"] and row["no more work"]["stable"]]
-    asked = np.array([row["no more work"]["work"] / row["nominal"]["work"] for row in within])
+    within = [row for row in rows if row["nominal"]["stable"] and row["work limited"]["stable"]]
+    asked = np.array([row["work limited"]["work"] / row["nominal"]["work"] for row in within])
     more = [_more_work(row) for row, over in zip(before, harder, strict=True) if over > 1 + WORSE]
     outcome.table(f"plants on which the redesign does over {100 * WORSE:g} % more work than the nominal design", more)
     unstable = [row for row in rows if not row["nominal"]["stable"]]
@@ -197,12 +197,12 @@ def report(outcome, rows):
         f"Of {len(rows)} hidden plants the nominal design is unstable on {len(unstable)}, the redesign on {len(lost)}."
         f" Where both are stable, it costs {np.median(worse):.3f} times the nominal design (median),"
         f" at most {worse.max():.3f} times, and {np.median(harder):.3f} times the work, {harder.max():.3f} at most."
-        f" On {sum(not row['pays'] for row in rows)} the present controller is kept; where no more work is allowed, on"
-        f" {sum(not row['pays, no more work'] for row in rows)}, and the work is {asked.max():.3f} times at most."
+        f" On {sum(not row['improves'] for row in rows)} the present controller is kept; with the work limited, on"
+        f" {sum(not row['improves, work limited'] for row in rows)}, and the work is {asked.max():.3f} times at most."
         f" {100 * inside.mean():.1f} % of the readings lie inside the 95 % bands predicted for the redesigned loop"
         f" (median of the plants {100 * np.median(inside):.1f} %, worst {100 * inside.min():.1f} %)."
     )
-    most = {"cost": worse.max(), "work": harder.max(), "work, where no more is allowed": asked.max()}
+    most = {"cost": worse.max(), "work": harder.max(), "work, where it is limited": asked.max()}
     outcome.table("over the nominal design, most", most)
     outcome.say(
         f"On {len(more)} the redesign does over {100 * WORSE:g} % more work than the nominal design;"
@@ -216,14 +216,14 @@ def report(outcome, rows):
     away = abs(ratios["work"] - 1.0)
     outcome.check("redesign over the design on the true effects, work: median away from one", away, 0.05)
     unsafe = [row for row in rows if not row["redesigned"]["stable"] and row["safe"]]
-    outcome.check("plants on which a redesign that was called safe is unstable", len(unsafe), 0)
-    for what, over in (("costs", worse), ("is asked for no more work and does", asked)):
+    outcome.check("plants on which a redesign reported as safe is unstable", len(unsafe), 0)
+    for what, over in (("costs", worse), ("with its work limited does", asked)):
         words = f"{what} over {100 * WORSE:g} % more {'work ' * (over is asked)}than the nominal design"
         outcome.check(f"plants on which the redesign {words}", int((over > 1 + WORSE).sum()), 0)
-    wasted = sum(row["vibration"] > 1.0 for row in more)
-    outcome.check("plants of those with more work on which it leaves more vibration", wasted, 0)
-    spoilt = [row for row in lost if row["nominal"]["stable"]]
-    outcome.check("plants that the nominal design keeps stable and the redesign does not", len(spoilt), 0)
+    with_more_vibration = sum(row["vibration"] > 1.0 for row in more)
+    outcome.check("of these, plants with more vibration", with_more_vibration, 0)
+    destabilised = [row for row in lost if row["nominal"]["stable"]]
+    outcome.check("plants that the nominal design keeps stable and the redesign does not", len(destabilised), 0)
     outcome.check("share of readings inside the 95 % bands", inside.mean(), 0.90, at_least=True)
     outcome.check("share of readings inside the 95 % bands, at most", inside.mean(), 0.99)
     outcome.figure(
@@ -239,14 +239,15 @@ def _more_work(row):
     return {
         "kinds": row["kinds"],
         "work": [one["work"] / nominal["work"] for one in (redesigned, best)],
-        "taken out": (redesigned["work"] - redesigned["work put in"]) / (nominal["work"] - nominal["work put in"]),
-        "put in": redesigned["work put in"] / max(nominal["work put in"], 1e-300),
+        "energy extracted": (redesigned["work"] - redesigned["energy supplied"])
+        / (nominal["work"] - nominal["energy supplied"]),
+        "energy supplied": redesigned["energy supplied"] / max(nominal["energy supplied"], 1e-300),
         "vibration": redesigned["vibration"] / nominal["vibration"],
         "cost": redesigned["cost"] / nominal["cost"],
     }
 
 
-def _told(outcome, result) -> bool:
+def _has_ended(outcome, result) -> bool:
     if result.error is not None:
         outcome.say(f"plant {result['index']}: {result.error}")
     return result.error is None
