@@ -328,7 +328,7 @@ def _leaves_far_more_than_noise(found: Attribution, shrinkage: Shrinkage | None,
     if found.outcome != "explained" or shrinkage is None or are_small(sizes_of(errors)) or _unpredictable(found):
         return False
     _, after, floor = _powers(shrinkage)
-    return bool((after > JOINT.credible**2 * floor + beyond).any())
+    return bool((after > JOINT.credible_noise**2 * floor + beyond).any())
 
 
 def _power_beyond_effects(

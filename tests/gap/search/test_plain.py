@@ -298,7 +298,7 @@ def test_sensitivities_on_some_records_are_not_kept_for_all_where_the_simulation
         lambda rig, effects, data: np.inf if len(data.records) == 2 and next(far, False) else level(rig, effects, data),
     )
     step = beside_errors(both)
-    assert len(step.errors.values) >= JOINT.few and step.fit.cost_by_channel.shape == (2, 4)
+    assert len(step.errors.values) >= JOINT.few_errors and step.fit.cost_by_channel.shape == (2, 4)
 
 
 def test_an_effect_that_smooth_errors_could_mimic_stays_significant(search):

@@ -86,7 +86,9 @@ def test_what_two_effects_come_to_is_least_squares_within_bounds():
 
 def test_both_halves_of_a_pair_are_found_at_once(rig, search):
     reconstruction = ForceReconstruction.of(rig, search.data)
-    best = fitted_ahead(search, Screening.of(search, (), reconstruction).likeliest_pairs(SELECTION.tried))[0]
+    best = fitted_ahead(search, Screening.of(search, (), reconstruction).likeliest_pairs(SELECTION.fits_to_one_record))[
+        0
+    ]
     named = {effect.label: effect.values for effect in best.effects}
     assert set(named) == {"cubic_spring", "sensor_gain[d3]"} and best.cost < 1.05
     assert named["cubic_spring"]["at"] == pytest.approx(0.62, abs=1e-3)
@@ -156,7 +158,7 @@ def test_what_one_half_of_a_wrong_pair_leaves_tells_the_other(search):
     )
     pairs = Pairs(search)
     pairs.ahead = [fit(search.rig, wrong, search.ahead, iterations=4)]
-    assert pairs.ahead[0].cost > SELECTION.promising
+    assert pairs.ahead[0].cost > SELECTION.max_residual_ahead
     assert pairs.by_exchange()
     found = pairs.found[0]
     assert found.key == ("cubic_spring", "sensor_gain[d3]")

@@ -166,7 +166,7 @@ class Budget:
     def is_noise_at_bound(self) -> tuple[bool, ...]:
         """Whether each sensor's estimated noise is at the bound of the search, or above it: then it may be lower."""
         ratios = np.array(self.noise_found) / np.array(self.noise_stated)
-        bounds = JOINT.credible, JOINT.credible_guess
+        bounds = JOINT.credible_noise, JOINT.credible_guessed_noise
         at_bound = [np.abs(ratios / bound - 1.0) < 1.0 - AT_BOUND for bound in bounds]
         return tuple(bool(at) for at in np.any(at_bound, axis=0) | (ratios > max(bounds)))
 
@@ -176,7 +176,7 @@ class Budget:
         ratio = self.noise_ratio
         if 1.0 / REMARKED < ratio < REMARKED:
             return None
-        if ratio > AT_BOUND * JOINT.credible:
+        if ratio > AT_BOUND * JOINT.credible_noise:
             return (
                 f"The residual is {ratio:.2g} times the model's noise_std or more: more noise than stated, or errors of"
                 " the model that neither effects nor small errors describe."

@@ -128,10 +128,14 @@ class Attribution:
         What was given comes first, and is beside each of the others.
         """
         kinds = {f.effects[0].kind for f in self.tried if f.effects}
-        others = [f for f in best_of_each_kind(self.ahead) if f.effects[0].kind not in kinds][: ATTRIBUTION.shown]
+        others = [f for f in best_of_each_kind(self.ahead) if f.effects[0].kind not in kinds][
+            : ATTRIBUTION.shown_singles
+        ]
 
         def on_all(candidate: Fit) -> Fit:
-            return fit(self.search.rig, candidate.effects, self.search.data, iterations=5, tolerance=ATTRIBUTION.alike)
+            return fit(
+                self.search.rig, candidate.effects, self.search.data, iterations=5, tolerance=ATTRIBUTION.cost_tolerance
+            )
 
         fitted = one_blas_thread(self.search.workers.map)(on_all, others)
         alone = best_of_each(sorted((*self.tried, *fitted), key=lambda f: f.cost))
@@ -233,7 +237,7 @@ def attribute(
     search = stages.search
     is_cut = search.is_over
     final_search = own_search or search
-    if seen and outcome == "unknown" and start.cost - 1.0 < ATTRIBUTION.very_near * (of_nominal.mean() - 1.0):
+    if seen and outcome == "unknown" and start.cost - 1.0 < ATTRIBUTION.noise_share * (of_nominal.mean() - 1.0):
         outcome, best, alternatives, noise = "explained", start, (), None  # nothing explains the little that is left
     best = uniform_as_nominal_errors(search, best, alone=random is not None)
     if outcome == "explained" and random is None:
@@ -296,11 +300,11 @@ def _with_one_for_two(search: Search, best: Fit) -> Fit:
     if len(linear) < 2 or any(effect.kind is NOMINAL_ERRORS for effect in best.effects):
         return best
     narrow = replace(search, catalogue=kinds)
-    here = cost_of(search.rig, best.effects, search.data.finely(SELECTION.fine))
+    here = cost_of(search.rig, best.effects, search.data.finely(SELECTION.substeps))
     for two in combinations(linear, 2):
         rest = tuple(effect for effect in best.effects if effect not in two)
         ahead = one_more(narrow, rest, search.reconstruction_with(rest))
-        for fewer in on_whole_records(narrow, ahead, PAIRS.more):
+        for fewer in on_whole_records(narrow, ahead, PAIRS.finalists_beside):
             extra = max(best.n_parameters - fewer.n_parameters, 0)
             if search.explains(fewer) and not search.distinguishes(here, fewer.cost, extra):
                 return fewer
@@ -322,8 +326,10 @@ def _merged(search: Search, best: Fit, alternatives: Alternatives) -> tuple[Fit,
 
 def _refitted(search: Search, effects: Sequence[Effect], data: FitData) -> Fit:
     """The effects refitted to all records from good start values, whether or not the deadline is past."""
-    finely = replace(data.finely(SELECTION.fine), deadline=NEVER)
-    return fit(search.rig, effects, finely, iterations=ATTRIBUTION.together, workers=search.workers, chord=Chord())
+    finely = replace(data.finely(SELECTION.substeps), deadline=NEVER)
+    return fit(
+        search.rig, effects, finely, iterations=ATTRIBUTION.joint_iterations, workers=search.workers, chord=Chord()
+    )
 
 
 def _significant(search: Search, best: Fit, seen: Sequence[Effect], logged: float) -> Fit:
@@ -332,7 +338,7 @@ def _significant(search: Search, best: Fit, seen: Sequence[Effect], logged: floa
     An effect stays if the records need it: they may determine only a combination of its parameters. A limiting case
     is, for example, a damper for friction far below its smoothing speed, or one force of friction for two directions.
     """
-    data, rig = search.data.finely(SELECTION.fine), search.rig
+    data, rig = search.data.finely(SELECTION.substeps), search.rig
 
     for effect in best.effects:
         if effect.is_in_readings or effect.kind.applied_first:
@@ -379,7 +385,7 @@ def _without_negligible_parameters(search: Search, best: Fit) -> Fit:
 
     The standard error at one point of a stiff law does not show that.
     """
-    data = search.data.finely(SELECTION.fine)
+    data = search.data.finely(SELECTION.substeps)
     for effect in best.effects:
         settled = effect.kind.without_negligible(effect)
         if settled is effect:
@@ -401,7 +407,9 @@ def with_identified_errors(search: Search, best: Fit, identified: IdentifiedPrio
         return best
 
     def fitted_with(effects: Sequence[Effect], errors: Effect) -> Fit:
-        return fit(search.rig, (*effects, errors), search.data, iterations=ATTRIBUTION.together, workers=search.workers)
+        return fit(
+            search.rig, (*effects, errors), search.data, iterations=ATTRIBUTION.joint_iterations, workers=search.workers
+        )
 
     found = fitted_with(others, nominal_errors(search.rig, identified))
     while len(found.effects) > 2:
@@ -422,7 +430,7 @@ def _input_noise_of(search: Search, best: Fit, noise: np.ndarray) -> float:
     residual_power = search.data.by_channel(search.data.residual(rig))
     sensor_noise = (noise / search.data.noise) ** 2
     share = logging_noise(residual_power, sensor_noise, search.logging_noise)
-    is_small = (residual_power.mean(axis=1) < (1.0 + ATTRIBUTION.a_tenth) * sensor_noise.mean()).all()
+    is_small = (residual_power.mean(axis=1) < (1.0 + ATTRIBUTION.tenth_louder) * sensor_noise.mean()).all()
     if not is_small:
         return share
     data = search.data.with_noise(noise)

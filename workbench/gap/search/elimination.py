@@ -47,7 +47,7 @@ def simplest_step(
     size = partial(size_of_set, search)
     # a set of as many parameters may fit better: friction, for a hysteretic spring that always slides
     best = min((best, *(s for s in sets if size(s) == size(best))), key=lambda s: s.fit.cost)
-    excess_limit = (1.0 + STEPWISE.simpler) * max(best.excess(best.sensor_noise), STEPWISE.simpler)
+    excess_limit = (1.0 + STEPWISE.simpler_increase) * max(best.excess(best.sensor_noise), STEPWISE.simpler_increase)
     limiting_cases = contained(best.effects, search.rig)
     fewer = [
         step
@@ -63,7 +63,7 @@ def _refitted_to_all(search: Search, on_quick: Sequence[JointFit], best: JointFi
     """The steps; those that may be as good as `best`, which was fitted to all records, are refitted to all."""
     if not best.explains:
         return on_quick
-    cost_limit = max(STEPWISE.near * best.fit.cost, SEARCH.negligible * gap)
+    cost_limit = max(STEPWISE.max_cost_ratio * best.fit.cost, SEARCH.negligible_share * gap)
     return search.workers.map(
         lambda s: fit_jointly(search, s.effects, s.errors, rounds=2) if s.fit.cost < cost_limit else s, on_quick
     )
@@ -74,10 +74,10 @@ def _simpler_singles(search: Search, best: JointFit, ahead: Sequence[Fit]) -> li
     if len(best.effects) != 1 or not ahead:
         return []
     size, nominal = size_of_set(search, best)[0], search.nominal_ahead
-    good = nominal - STEPWISE.as_good * (nominal - ahead[0].cost)
+    good = nominal - STEPWISE.equal_gain_share * (nominal - ahead[0].cost)
     likely = [f.effects for f in best_of_each_kind(ahead) if f.cost <= good and f.n_parameters < size]
     on_quick = fitted_to_quick(search, likely, best)
-    near = [step for step in on_quick if step.fit.cost < STEPWISE.near * best.fit.cost]
+    near = [step for step in on_quick if step.fit.cost < STEPWISE.max_cost_ratio * best.fit.cost]
     fitted = [fitted_to_all(search, step) for step in near]
     return [step for step in fitted if not may_be_transducer_errors(search, step.effects)]
 
@@ -94,7 +94,7 @@ def limiting_case(search: Search, step: JointFit, gap: float) -> JointFit:
     return limiting_case(search, min(as_good, key=lambda s: s.fit.cost), gap) if as_good else step
 
 
-def is_as_good(step: JointFit, best: JointFit, gap: float, *, share: float = JOINT.plausible) -> bool:
+def is_as_good(step: JointFit, best: JointFit, gap: float, *, share: float = JOINT.plausible_share) -> bool:
     """Whether a step with plausible nominal errors fits almost as well as the best, which does not explain the gap.
 
     Implausible nominal errors do not count: they may have absorbed an effect.
@@ -103,7 +103,7 @@ def is_as_good(step: JointFit, best: JointFit, gap: float, *, share: float = JOI
         share: of the largest plausible errors: larger ones are implausible.
     """
     more = step.excess(best.sensor_noise) - best.excess(best.sensor_noise)
-    return not (too_large(step.errors, share=share) or best.explains) and more < SEARCH.negligible * gap
+    return not (too_large(step.errors, share=share) or best.explains) and more < SEARCH.negligible_share * gap
 
 
 def backward_eliminated(search: Search, step: JointFit) -> JointFit:
@@ -112,7 +112,7 @@ def backward_eliminated(search: Search, step: JointFit) -> JointFit:
     if not fewer:  # no effect can act without the others
         return step
     best = min(fewer, key=lambda s: s.fit.cost)
-    excess_limit = (1.0 + STEPWISE.needless) * max(step.excess(step.sensor_noise), STEPWISE.simpler)
+    excess_limit = (1.0 + STEPWISE.smaller_increase) * max(step.excess(step.sensor_noise), STEPWISE.simpler_increase)
     is_needless = best.excess(step.sensor_noise) < excess_limit and (best.is_plausible or not step.is_plausible)
     return backward_eliminated(search, best) if is_needless else step
 

@@ -45,7 +45,7 @@ DELAYS_OF_ALL = (SENSOR_LAG, ACTUATOR_LAG, ACTUATOR_DELAY)  # kinds that delay a
 def are_uniform_errors(effects: Sequence[Effect]) -> bool:
     """Whether the effects are just the two uniform errors (stiffness, damping), each small enough for a model's."""
     return {effect.kind for effect in effects} == set(UNIFORM) and all(
-        abs(np.log(effect.values["factor"])) < dict(ERRORS.most_common)[effect.kind.name] for effect in effects
+        abs(np.log(effect.values["factor"])) < dict(ERRORS.max_uniform)[effect.kind.name] for effect in effects
     )
 
 
@@ -68,14 +68,14 @@ def may_be_small_error(effect: Effect, errors: Effect, search: Search) -> bool:
         search: of both.
     """
     numbers = {p.name: p.neutral for p in effect.parameters(search.rig) if p.neutral is not None}
-    reach = {name: ERRORS.wide * effect.std.get(name, 0.0) for name in numbers}
+    reach = {name: ERRORS.interval_width * effect.std.get(name, 0.0) for name in numbers}
     nearer = {
         name: float(np.clip(neutral, effect.values[name] - reach[name], effect.values[name] + reach[name]))
         for name, neutral in numbers.items()
     }
     smallest = replace(effect, values={**effect.values, **nearer})
     if effect.kind in UNIFORM:
-        return bool(abs(np.log(smallest.values["factor"])) < dict(ERRORS.most_alone)[effect.kind.name])
+        return bool(abs(np.log(smallest.values["factor"])) < dict(ERRORS.max_uniform_alone)[effect.kind.name])
     if is_linear_structural(effect.kind):
         return any(nearer[name] == neutral for name, neutral in numbers.items())
     if smallest.values.get("gain", 1.0) <= 0.0:  # wired the wrong way round
@@ -86,8 +86,8 @@ def may_be_small_error(effect: Effect, errors: Effect, search: Search) -> bool:
 
 def is_plausible_delay(effect: Effect, search: Search, errors: Effect | None = None) -> bool:
     """Whether an effect is a delay that a careful laboratory may have, or no outlier among delays (`errors`)."""
-    among_others = 0.0 if errors is None else ERRORS.outlying * size_of(errors, "delay")
-    return delay_of(effect) < max(dict(JOINT.widest)["delay"], among_others) * search.data.records[0].sample_time
+    among_others = 0.0 if errors is None else ERRORS.outlier_ratio * size_of(errors, "delay")
+    return delay_of(effect) < max(dict(JOINT.max_prior_std)["delay"], among_others) * search.data.records[0].sample_time
 
 
 def delay_of(effect: Effect) -> float:
@@ -98,12 +98,12 @@ def delay_of(effect: Effect) -> float:
 def is_plausible_gain_or_place(effect: Effect, rig: Rig) -> bool:
     """Whether an effect is a gain error or a shift of place within the accuracy of calibration and tape measure."""
     if "gain" in effect.values:
-        return bool(abs(np.log(abs(effect.values["gain"]))) < ERRORS.most_gain)
+        return bool(abs(np.log(abs(effect.values["gain"]))) < ERRORS.max_gain)
     places = [a.at for a in rig.actuators if a.name == effect.target]
     places += [s.at for s in rig.sensors if s.name == effect.target]
     if effect.at is None or not places:
         return False
-    return rig.modes.domain.separation(effect.at, middle(places[0])) < ERRORS.most_moved
+    return rig.modes.domain.separation(effect.at, middle(places[0])) < ERRORS.max_misplacement
 
 
 def may_be_transducer_errors(search: Search, effects: Sequence[Effect]) -> bool:
@@ -130,7 +130,7 @@ def uniform_as_nominal_errors(search: Search, found: Fit, *, alone: bool = False
     named = [e for e in others if e is not transducer_errors]
     if not named or len(uniform) < (1 if alone else len(UNIFORM)):
         return found
-    largest = dict(ERRORS.most_alone if len(uniform) == 1 else ERRORS.most_common)
+    largest = dict(ERRORS.max_uniform_alone if len(uniform) == 1 else ERRORS.max_uniform)
     if any(abs(size) >= largest[name] for name, size in uniform.items()):
         return found
     if transducer_errors is not None and not set(transducer_errors.target.groups) <= set(TRANSDUCER_GROUPS):
@@ -158,10 +158,10 @@ def delay_effects(rig: Rig, errors: Effect) -> tuple[Effect, ...]:
     cause is a lag of the sensors or of the actuators, or a delay of the actuators.
     """
     delays = {name.removeprefix("delay_"): float(delay) for name, delay in in_group(errors.values, "delay").items()}
-    uncertainty = {name: ERRORS.sure * errors.std.get(f"delay_{name}", 0.0) for name in delays}
-    late = [name for name, delay in delays.items() if abs(delay) > max(ERRORS.smallest_delay, uncertainty[name])]
+    uncertainty = {name: ERRORS.standard_errors * errors.std.get(f"delay_{name}", 0.0) for name in delays}
+    late = [name for name, delay in delays.items() if abs(delay) > max(ERRORS.min_delay, uncertainty[name])]
     sample_time = errors.target.sample_time
-    if len(delays) >= ERRORS.several and len(late) == 1 and delays[late[0]] > 0:
+    if len(delays) >= ERRORS.several_sensors and len(late) == 1 and delays[late[0]] > 0:
         delay = delays[late[0]] * sample_time
         return Effect(SENSOR_DELAY, late[0], {"delay": delay}), Effect(SENSOR_LAG, late[0], {"time_constant": delay})
     if len(delays) < 2 or len(late) < len(delays) or min(delays.values()) < 0:
@@ -169,7 +169,7 @@ def delay_effects(rig: Rig, errors: Effect) -> tuple[Effect, ...]:
     mean = float(np.mean([*delays.values()]))
     largest_difference = max(max(abs(delay - mean), uncertainty[name]) for name, delay in delays.items())
     probability = (2.0 * largest_difference / mean) ** (len(delays) - 1)  # that independent delays agree as closely
-    if probability > ERRORS.by_chance:
+    if probability > ERRORS.coincidence_probability:
         return ()
     return common_delays(rig, mean * sample_time)
 
@@ -226,16 +226,18 @@ def with_delay_as_error(search: Search, errors: Effect, late: Effect) -> Effect:
 
 def with_wrong_transducers(search: Search, step: JointFit) -> JointFit:
     """The step with errors of gain and place as effects, each too large for a careful laboratory and outlying."""
-    for _ in range(ERRORS.wrong_transducers):
+    for _ in range(ERRORS.max_wrong_transducers):
         suspect = max(_suspects(search, step), key=lambda s: s.size, default=None)
         if suspect is None:
             break
         effect = suspect.effect
         others = [e for e in step.effects if (e.kind, e.target) != (effect.kind, effect.target)]
         found = fit_from_zero(search, (*others, effect))  # other nominal errors have absorbed part of it
-        group, limit = ("gain", ERRORS.most_gain) if "gain" in effect.values else ("place", ERRORS.most_moved)
-        is_wrong = _size(search.rig, found.effects[-1]) >= max(limit, ERRORS.outlying * size_of(found.errors, group))
-        is_as_near = found.explains or found.fit.cost < STEPWISE.near * step.fit.cost
+        group, limit = ("gain", ERRORS.max_gain) if "gain" in effect.values else ("place", ERRORS.max_misplacement)
+        is_wrong = _size(search.rig, found.effects[-1]) >= max(
+            limit, ERRORS.outlier_ratio * size_of(found.errors, group)
+        )
+        is_as_near = found.explains or found.fit.cost < STEPWISE.max_cost_ratio * step.fit.cost
         if not (is_wrong and is_as_near and search.are_noticeable(found.effects, found.fit.effects)):
             break
         step = found
@@ -259,14 +261,14 @@ def _suspects(search: Search, step: JointFit) -> Iterator[_Suspect]:
         for nominal, transducer in transducers:
             known = named.get((of_gain, nominal.name))
             gain = transducer.gain / nominal.gain if nominal.gain else 1.0
-            size = abs(float(np.log(gain))) / ERRORS.most_gain
-            if of_gain in search.catalogue and size > ERRORS.suspect:
+            size = abs(float(np.log(gain))) / ERRORS.max_gain
+            if of_gain in search.catalogue and size > ERRORS.tested_share:
                 gain *= 1.0 if known is None else known.values["gain"]
                 yield _Suspect(Effect(of_gain, nominal.name, {"gain": gain}), size)
             if of_place in search.catalogue and step.errors.target.place and (of_place, nominal.name) not in named:
                 effect = Effect(of_place, nominal.name, place_values(middle(transducer.at)))
-                size = _size(rig, effect) / ERRORS.most_moved
-                if size > ERRORS.suspect:
+                size = _size(rig, effect) / ERRORS.max_misplacement
+                if size > ERRORS.tested_share:
                     yield _Suspect(effect, size)
 
 
@@ -286,7 +288,7 @@ def with_uniform_effects(search: Search, step: JointFit) -> JointFit:
     damping = float(np.mean([*dampings.values()] or [0.0]))
     stiffness = values.get("stiffness_0", 0.0) - values.get("mass_0", 0.0)
     named = {effect.kind for effect in step.effects}
-    added, reset, largest = [], dict(values), dict(ERRORS.most_common)
+    added, reset, largest = [], dict(values), dict(ERRORS.max_uniform)
     if abs(damping) > largest["modal_damping"] and MODAL_DAMPING not in named:
         added.append(Effect(MODAL_DAMPING, None, {"factor": float(np.exp(damping))}))
         reset.update({name: value - damping for name, value in dampings.items()})

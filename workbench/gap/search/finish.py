@@ -30,20 +30,20 @@ TRANSDUCERS = ("actuator", "sensor")  # paths of effects of actuators and sensor
 def finished(search: Search, candidate: Fit) -> Fit:
     """The set refitted to all records with finer substeps until convergence, unless these lower the cost little."""
     if candidate.falling == 0 and not search.explains(candidate):
-        fine_cost = cost_of(search.rig, candidate.effects, search.data.finely(SELECTION.fine))
-        if fine_cost - 1.0 > FINISH.no_nearer * (candidate.cost - 1.0):
+        fine_cost = cost_of(search.rig, candidate.effects, search.data.finely(SELECTION.substeps))
+        if fine_cost - 1.0 > FINISH.integration_share * (candidate.cost - 1.0):
             return _by_finest_steps(search, candidate)
-    ended = fit(search.rig, candidate.effects, search.data.finely(SELECTION.fine), iterations=25, tolerance=1e-7)
+    ended = fit(search.rig, candidate.effects, search.data.finely(SELECTION.substeps), iterations=25, tolerance=1e-7)
     return _by_finest_steps(search, ended)
 
 
 def _by_finest_steps(search: Search, ended: Fit) -> Fit:
     """The set refitted with the finest substeps, if only the integration error may keep it above the noise floor."""
-    is_near = ended.cost < FINISH.all_but or search.near(ended, FINISH.stepping)
+    is_near = ended.cost < FINISH.refinement_cost or search.near(ended, FINISH.integration_error)
     if search.explains(ended) or not is_near or not is_stepped(apply_all(search.rig, ended.effects)):
         return ended
     # its parameters have absorbed integration errors, so its cost with finer substeps means nothing before a fit
-    finely = fit(search.rig, ended.effects, search.data.stepped(FINISH.finest), iterations=6, tolerance=1e-5)
+    finely = fit(search.rig, ended.effects, search.data.stepped(FINISH.substeps), iterations=6, tolerance=1e-5)
     return _with_stepping(search, finely) if finely.cost < ended.cost else ended
 
 
@@ -55,7 +55,8 @@ def _with_stepping(search: Search, finely: Fit) -> Fit:
     if search.explains(finely):
         return finely
     fine, half = (
-        finite_residual(search.rig, finely.effects, search.data.stepped(n)) for n in (FINISH.finest, FINISH.finest // 2)
+        finite_residual(search.rig, finely.effects, search.data.stepped(n))
+        for n in (FINISH.substeps, FINISH.substeps // 2)
     )
     if fine is None or half is None:
         return finely
@@ -71,11 +72,13 @@ def widened(search: Search, found: Fit) -> Fit:
     sets, kinds = list(more_general_sets(found.effects)), {effect.kind for effect in found.effects}
     if not sets:
         return found
-    data = search.data.finely(SELECTION.fine)
+    data = search.data.finely(SELECTION.substeps)
     cost = cost_of(search.rig, found.effects, data)
 
     def refitted(effects: Sequence[Effect]) -> Fit:
-        return fit(search.rig, effects, data, iterations=FINISH.widening, workers=search.workers, chord=Chord())
+        return fit(
+            search.rig, effects, data, iterations=FINISH.generalising_iterations, workers=search.workers, chord=Chord()
+        )
 
     for effects in sets:
         trial = refitted(effects)
@@ -115,7 +118,7 @@ def relocated(search: Search, candidate: Fit) -> Fit:
         here = fit(search.rig, candidate.effects, search.quick, iterations=6)
         for moved in _elsewhere(search, candidate.effects, i):
             started = fit(search.rig, moved, search.quick, iterations=6)
-            if promise(started) > FINISH.lower * here.cost:
+            if promise(started) > FINISH.max_place_cost * here.cost:
                 continue
             trial = fit(search.rig, started.effects, search.data, iterations=10)
             if trial.cost < candidate.cost:
@@ -135,14 +138,14 @@ def _elsewhere(search: Search, effects: tuple[Effect, ...], i: int) -> list[tupl
 
     strength = next((p for p in effect.parameters(search.rig) if p.logarithmic and p.name not in COORDINATES), None)
     # where the structure moves less, an effect must be stronger to do the same
-    factors = FINISH.factors if strength is not None else (1.0,)
+    factors = FINISH.strength_factors if strength is not None else (1.0,)
     tried = []
     for where in other_places(effect, domain):
         strengths = [moved(where, factor) for factor in factors]
         start = min(strengths, key=lambda s: cost_of(search.rig, s, search.first))
-        tried.append(fit(search.rig, start, search.first, iterations=FINISH.tried))
+        tried.append(fit(search.rig, start, search.first, iterations=FINISH.place_iterations))
     tried.sort(key=lambda f: f.cost)
-    elsewhere = [f for f in tried if domain.separation(f.effects[i].at, effect.at) > SEARCH.same_place]
+    elsewhere = [f for f in tried if domain.separation(f.effects[i].at, effect.at) > SEARCH.same_distance]
     # a mirrored place may be the other minimum even if its cost is high before a fit
     return [*(f.effects for f in elsewhere[:2]), *map(moved, _mirrored(effect.at, domain))]
 
@@ -194,9 +197,12 @@ def simplest(search: Search, candidate: Fit) -> Fit:
     cost = cost_of(search.rig, candidate.effects, search.quick)
 
     def as_good(effects: tuple[Effect, ...]) -> Fit | None:
-        if promise(fit(search.rig, effects, search.quick, iterations=FINISH.at_first)) > FINISH.too_far * cost:
+        if (
+            promise(fit(search.rig, effects, search.quick, iterations=FINISH.first_iterations))
+            > FINISH.max_cost_ratio * cost
+        ):
             return None
-        trial = fit(search.rig, effects, search.data.finely(SELECTION.fine), iterations=12, tolerance=1e-7)
+        trial = fit(search.rig, effects, search.data.finely(SELECTION.substeps), iterations=12, tolerance=1e-7)
         return trial if search.explains(trial) and not _pays(search, candidate, trial) else None
 
     simpler = next(filter(None, search.workers.map(as_good, _simpler_sets(search, candidate))), None)
@@ -207,7 +213,7 @@ def _simpler_sets(search: Search, candidate: Fit) -> Iterator[tuple[Effect, ...]
     """The sets without one effect whose cost stays near the noise floor, and the limiting cases of the set."""
     for effect in candidate.effects if len(candidate.effects) > 1 else ():
         rest = tuple(other for other in candidate.effects if other is not effect)
-        if cost_of(search.rig, rest, search.data) < 1.0 + FINISH.idle:
+        if cost_of(search.rig, rest, search.data) < 1.0 + FINISH.redundant_gain:
             yield rest
     yield from simpler_sets(candidate.effects, search.rig)
 
@@ -249,13 +255,13 @@ def with_equals(
         reconstruction: of the nominal rig, for start values.
         alike: labels of two effects that the records cannot distinguish, and their correlation.
     """
-    data = search.data.finely(SELECTION.fine)
+    data = search.data.finely(SELECTION.substeps)
     known = {best.key, *(f.key for f, _ in alternatives)}
     sets = [s for s in _at_other_transducers(search, best, reconstruction, alike) if key_of(s) not in known]
     if not sets:
         return alternatives
     here, *each = search.workers.map(lambda s: fit(search.rig, s, data), [best.effects, *sets])
-    equals = [f for f in each if f.cost < here.cost + SEARCH.alternative]
+    equals = [f for f in each if f.cost < here.cost + SEARCH.alternative_margin]
     if not equals:
         return alternatives
     weighted = _weighted(search, [here, *equals])

@@ -145,7 +145,7 @@ class _Problem:
     ):
         self.workers, self.chord = workers, chord
         self.rig, self.data, self.effects, self.held = rig, data, tuple(effects), tuple(held)
-        self.coarse = data.stepped(min(FIT.slope_substeps, data.substeps))
+        self.coarse = data.stepped(min(FIT.sensitivity_substeps, data.substeps))
         self.parameters = parameters_of(rig, self.effects)
         self.start = np.array([p.to_free(self.effects[i].values[p.name]) for i, p in self.parameters])
         each = zip(self.parameters, self.start, strict=True)
@@ -167,7 +167,9 @@ class _Problem:
     @cached_property
     def is_coarsened(self) -> bool:
         """Whether sensitivities are simulated with coarser substeps than residuals."""
-        return self.data.substeps > FIT.slope_substeps and is_stepped(apply_all(self.rig, (*self.effects, *self.held)))
+        return self.data.substeps > FIT.sensitivity_substeps and is_stepped(
+            apply_all(self.rig, (*self.effects, *self.held))
+        )
 
     def at(self, free: np.ndarray) -> tuple[Effect, ...]:
         values = [dict(effect.values) for effect in self.effects]
@@ -284,7 +286,7 @@ class _Problem:
         )
         acceleration[moving] = -0.5 * np.linalg.solve(damped[np.ix_(moving, moving)], curvature[moving])
         with np.errstate(over="ignore"):
-            small = 2.0 * np.linalg.norm(acceleration) < FIT.largest_curvature * np.linalg.norm(step)
+            small = 2.0 * np.linalg.norm(acceleration) < FIT.max_curvature * np.linalg.norm(step)
         return acceleration if small else np.zeros_like(step)
 
     def run(self, job: Move | Attempt) -> Any:
@@ -355,7 +357,7 @@ def _steps(parameter: Parameter, free: float) -> tuple[float, float]:
     """
     if parameter.logarithmic or parameter.name in COORDINATES:
         return 1e-4, 1.0 if parameter.logarithmic else 10.0
-    return FIT.short if parameter.prior_std else 1e-3 * abs(free) + 1e-9, 3.0 * abs(free) + 10.0
+    return FIT.nominal_error_step if parameter.prior_std else 1e-3 * abs(free) + 1e-9, 3.0 * abs(free) + 10.0
 
 
 def parameters_of(rig: Rig, effects: Sequence[Effect]) -> list[tuple[int, Parameter]]:
@@ -399,10 +401,12 @@ def slopes(
     """
     problem = _Problem(rig, effects, data, held, workers)
     if differences == "central":
-        problem.steps *= FIT.shorter
+        problem.steps *= FIT.std_step
     if differences == "wide":
         problem.steps *= [
-            FIT.wider_place if p.name in COORDINATES else FIT.wider * (1e-2 / FIT.short if p.prior_std else 1.0)
+            FIT.wide_place_step
+            if p.name in COORDINATES
+            else FIT.wide_step * (1e-2 / FIT.nominal_error_step if p.prior_std else 1.0)
             for _, p in problem.parameters
         ]
     residual = problem.residual(problem.start)
@@ -477,8 +481,8 @@ def _minimised(
         base, coarsely = problem.slope_base(free, residual)
         jacobian = problem.jacobian(free, base, coarsely, share)
         normal, gradient = problem.normal(jacobian), jacobian.T @ residual
-        dampings = accumulate([damping, *[FIT.less_far] * (FIT.attempts - 1)], mul)
-        least_decrease = FIT.promised * tolerance * cost
+        dampings = accumulate([damping, *[FIT.damping_factor] * (FIT.max_attempts - 1)], mul)
+        least_decrease = FIT.least_predicted_decrease * tolerance * cost
         attempts = (Attempt(free, coarsely, normal, gradient, each, least_decrease) for each in dampings)
         found = _first_descent(cost, attempts, share, problem.workers.at_once)
         if found is None:

@@ -43,7 +43,7 @@ def with_intervals(
         wide: long steps, for numerical errors of identified modes; as in `slopes`.
         logged: input noise, as a share of the inputs' rms.
     """
-    data = data.finely(SELECTION.fine)  # integration errors would count as scatter
+    data = data.finely(SELECTION.substeps)  # integration errors would count as scatter
     residual, jacobian = slopes(rig, found.effects, data, workers=workers, differences="wide" if wide else "central")
     if jacobian.shape[1] == 0:
         return found
@@ -121,7 +121,7 @@ def _with_secants_of_places(
         value = effects[i].values[parameter.name]
         room = max(value - parameter.low, parameter.high - value) / parameter.scale
         inwards = 1.0 if parameter.high - value > value - parameter.low else -1.0
-        linear_range = INTERVALS.straight * (parameter.high - parameter.low) / parameter.scale
+        linear_range = INTERVALS.linear_distance * (parameter.high - parameter.low) / parameter.scale
         step = deviation = _conditional_std(jacobian[:, j], level, parameter)
         for _ in range(INTERVALS.secants):
             # for a quadratic, the secant is proportional to the step: the geometric mean converges at once
@@ -174,7 +174,11 @@ def _plausible_prior(rig: Rig, effects: Sequence[Effect], i: int, jacobian: np.n
     """The prior variances of `_with_plausible_errors` for the nominal errors, effect i."""
     learnt: NominalPrior = effects[i].target
     normal = jacobian.T @ jacobian / level
-    careful = {g: max(INTERVALS.careful * size, getattr(learnt, g)) for g, size in JOINT.widest if g in learnt.groups}
+    careful = {
+        g: max(INTERVALS.prior_share * size, getattr(learnt, g))
+        for g, size in JOINT.max_prior_std
+        if g in learnt.groups
+    }
     sizes = careful
     for _ in range(INTERVALS.rounds):
         believed = replace(effects[i], target=replace(learnt, **sizes))
@@ -185,9 +189,10 @@ def _plausible_prior(rig: Rig, effects: Sequence[Effect], i: int, jacobian: np.n
         ratio = precision * (free**2 + np.diag(scaled_inverse(normal + np.diag(precision))))
         groups = np.array([group_of(p.name) if k == i else "" for k, p in parameters])
         sums = {g: size**2 * ratio[groups == g].sum() for g, size in sizes.items()}
-        n = {g: INTERVALS.counts + (groups == g).sum() for g in sizes}
+        n = {g: INTERVALS.prior_weight + (groups == g).sum() for g in sizes}
         sizes = {
-            g: max(np.sqrt((INTERVALS.counts * c**2 + sums[g]) / n[g]), getattr(learnt, g)) for g, c in careful.items()
+            g: max(np.sqrt((INTERVALS.prior_weight * c**2 + sums[g]) / n[g]), getattr(learnt, g))
+            for g, c in careful.items()
         }
     return replace(learnt, **sizes)
 
@@ -197,10 +202,10 @@ def _model_scatter(effect: Effect, parameter: Parameter) -> float:
     if parameter.prior_std is not None:
         return 0.0
     if parameter.logarithmic:
-        return INTERVALS.alike
+        return INTERVALS.model_difference
     value = effect.values[parameter.name]
     size = parameter.high if parameter.name in COORDINATES else abs(value - (parameter.neutral or 0.0))
-    return INTERVALS.alike * size / parameter.scale
+    return INTERVALS.model_difference * size / parameter.scale
 
 
 def _square_root(information: np.ndarray) -> np.ndarray:

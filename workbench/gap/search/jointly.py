@@ -33,7 +33,7 @@ def are_plausible(errors: Effect, *, damping: bool = True) -> bool:
     return not [group for group in too_large(errors) if damping or group != "damping"]
 
 
-def too_large(errors: Effect, *, share: float = JOINT.plausible) -> list[str]:
+def too_large(errors: Effect, *, share: float = JOINT.plausible_share) -> list[str]:
     """Groups of nominal errors that are larger than this share of the largest plausible ones."""
     return [group for group, size in _largest_plausible(errors.target) if size_of(errors, group) >= share * size]
 
@@ -46,7 +46,9 @@ def size_of(errors: Effect, group: str) -> float:
 
 def _largest_plausible(prior: NominalPrior) -> list[tuple[str, float]]:
     """(group, largest plausible standard deviation); with errors of each mode, damping ratios are mere guesses."""
-    return [(g, JOINT.guessed if g == "damping" and prior.by_mode else size) for g, size in JOINT.widest]
+    return [
+        (g, JOINT.max_guessed_damping if g == "damping" and prior.by_mode else size) for g, size in JOINT.max_prior_std
+    ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +87,7 @@ class JointFit:
     @property
     def explains(self) -> bool:
         """Whether the residual is at the noise floor of the sensors."""
-        return self.is_near(self.sensor_noise, STEPWISE.no_gap)
+        return self.is_near(self.sensor_noise, STEPWISE.noise_excess)
 
     def is_near(self, noise_power: np.ndarray, share: float) -> bool:
         """Whether the residual power exceeds a noise power by less than this share of it."""
@@ -95,8 +97,8 @@ class JointFit:
         """Description length, nats, of the nominal errors, and of the residual above noise unless `of_errors_alone`."""
         left = 0.0
         if not of_errors_alone:
-            left = JOINT.decisive * np.log1p(self.excess(noise_power) / float(noise_power.mean()))
-        for group, small in JOINT.small:
+            left = JOINT.residual_nats * np.log1p(self.excess(noise_power) / float(noise_power.mean()))
+        for group, small in JOINT.negligible_std:
             left += len(in_group(self.errors.values, group)) * np.log(max(size_of(self.errors, group), small) / small)
         return float(left)
 
@@ -123,7 +125,7 @@ def _gain(search: Search, best: JointFit, step: JointFit) -> float:
     return 2.0 * (loss(search, step) - loss(search, best)) / search.data.n_values
 
 
-def is_likelier(search: Search, best: JointFit, step: JointFit, least: float = SEARCH.significant) -> bool:
+def is_likelier(search: Search, best: JointFit, step: JointFit, least: float = SEARCH.significant_gain) -> bool:
     """Whether the likelihood surely prefers a set to a smaller one, beyond the imperfection of any model."""
     extra, gain = max(best.fit.n_parameters - step.fit.n_parameters, 1), _gain(search, best, step)
     return gain > least and search.is_justified(gain, extra)
@@ -159,23 +161,23 @@ def fit_jointly(
         until_convergence: fit until the cost is stationary, with fine substeps.
     """
     rounds = JOINT.rounds if rounds is None else rounds
-    whole, before = search.data.finely(SELECTION.fine) if until_convergence else search.data, np.inf
+    whole, before = search.data.finely(SELECTION.substeps) if until_convergence else search.data, np.inf
     if until_convergence:
-        errors = replace(errors, target=replace(errors.target, waves=JOINT.last_waves))
+        errors = replace(errors, target=replace(errors.target, waves=JOINT.final_waves))
     if known is None:
         errors = with_all_groups(search, errors)
     n_counted, chord = 0, Chord(known)
-    for i in range(JOINT.most_rounds):
+    for i in range(JOINT.max_rounds):
         # the two most informative records come first
         on_quick = known is not None or (i == 0 and not until_convergence)
         data = search.quick.stepped(whole.substeps) if on_quick else whole
         power = _residual_level(search.rig, (*effects, errors), data)
-        if power > (1.0 - (JOINT.last_settled if until_convergence else JOINT.settled)) * before:
+        if power > (1.0 - (JOINT.final_round_tolerance if until_convergence else JOINT.round_tolerance)) * before:
             break
-        fell, is_first = power < JOINT.falling * before, not np.isfinite(before)
+        fell, is_first = power < JOINT.large_decrease * before, not np.isfinite(before)
         n_counted += not fell or is_first
         # new sensitivities: of other records, far from the last ones, in the final fit, or if there are few
-        if known is None and (fell or is_first or until_convergence or len(errors.values) < JOINT.few):
+        if known is None and (fell or is_first or until_convergence or len(errors.values) < JOINT.few_errors):
             chord = Chord()
         before = power if known is not None or not on_quick else np.inf
         found = _fit_at_level(search, (*effects, errors), data, power, chord, is_last=until_convergence)
@@ -188,7 +190,7 @@ def fit_jointly(
         return evaluated(search, updated, whole.substeps)
     last = evaluated(search, _without_negligible_groups(updated), whole.substeps)
     # far above the noise floor, the prior variances mean little
-    if known is not None or not last.is_near(last.noise_power, JOINT.near):
+    if known is not None or not last.is_near(last.noise_power, JOINT.fixed_point_residual):
         return last
     at_limit = _at_fixed_point(search, found, whole, chord)
     if at_limit is found:
@@ -203,16 +205,16 @@ def _at_fixed_point(search: Search, found: Fit, data: FitData, chord: Chord) -> 
 
     The update alone converges slowly where the records hardly distinguish the errors; the cost is then flat.
     """
-    for _ in range(JOINT.rests):
+    for _ in range(JOINT.fixed_point_fits):
         errors = found.effects[-1]
         sizes = _limit_of_prior_stds(search, found)
         changes = [abs(np.log(size / getattr(errors.target, group))) for group, size in sizes.items()]
-        if max(changes, default=0.0) < JOINT.sized:
+        if max(changes, default=0.0) < JOINT.prior_change:
             break
         effects = (*found.effects[:-1], _with_prior_stds(errors, sizes))
-        kept = Chord() if len(effects[-1].values) < JOINT.few else chord
+        kept = Chord() if len(effects[-1].values) < JOINT.few_errors else chord
         power = _residual_level(search.rig, effects, data)
-        found = _fit_at_level(search, effects, data, power, kept, damping=JOINT.undamped)
+        found = _fit_at_level(search, effects, data, power, kept, damping=JOINT.fixed_point_damping)
     return found
 
 
@@ -231,8 +233,8 @@ def _fit_at_level(
         search.rig,
         effects,
         data.tempered(power),
-        iterations=JOINT.last_iterations if is_last else JOINT.iterations,
-        tolerance=JOINT.last_tolerance if is_last else JOINT.tolerance,
+        iterations=JOINT.final_iterations if is_last else JOINT.iterations,
+        tolerance=JOINT.final_tolerance if is_last else JOINT.tolerance,
         workers=search.workers,
         chord=chord,
         damping=damping,
@@ -283,7 +285,7 @@ def evaluated(search: Search, found: Fit, substeps: int | None = None) -> JointF
 def _largest_noise_ratio(data: FitData, coloured: np.ndarray) -> Floats:
     """Largest credible ratio of estimated to stated noise, by sensor (n_outputs,)."""
     guessed = np.array([name in data.guessed for name in data.records[0].output_names])
-    return np.where(guessed & coloured, JOINT.credible_guess, JOINT.credible)
+    return np.where(guessed & coloured, JOINT.credible_guessed_noise, JOINT.credible_noise)
 
 
 def _next_prior_stds(errors: Effect) -> dict[str, float]:
@@ -306,7 +308,7 @@ def _next_prior_std(scaled: Floats, size: float, widest: float) -> float:
     """
     values, spread = scaled
     n_determined = np.clip(1.0 - (spread / size) ** 2, 0.0, 1.0).sum()
-    return float(np.clip(np.sqrt((values**2).sum() / max(n_determined, 1e-3)), JOINT.narrowest * widest, widest))
+    return float(np.clip(np.sqrt((values**2).sum() / max(n_determined, 1e-3)), JOINT.min_prior_share * widest, widest))
 
 
 def _limit_of_prior_stds(search: Search, found: Fit) -> dict[str, float]:
@@ -331,14 +333,14 @@ def _limit_of_prior_stds(search: Search, found: Fit) -> dict[str, float]:
 
     assert found.normal is not None
     start = precision()
-    for _ in range(JOINT.likeliest):
+    for _ in range(JOINT.fixed_point_updates):
         now, before = precision(), dict(sizes)
         inverse = scaled_inverse(found.normal + np.diag(now - start))
         change = inverse[of_errors][:, of_errors] @ ((start - now)[of_errors] * free)
         scaled = np.array([free + change, np.sqrt(np.maximum(np.diag(inverse)[of_errors], 0.0))]) / unit
         for group in sizes:
             sizes[group] = _next_prior_std(scaled[:, groups == group], sizes[group], widest[group])
-        if all(abs(np.log(sizes[g] / before[g])) < 0.1 * JOINT.sized for g in sizes):
+        if all(abs(np.log(sizes[g] / before[g])) < 0.1 * JOINT.prior_change for g in sizes):
             break
     return sizes
 
@@ -358,7 +360,7 @@ def _without_negligible_groups(found: Fit) -> Fit:
     none = [
         g
         for g, widest in _largest_plausible(errors.target)
-        if getattr(errors.target, g) <= 1.01 * JOINT.narrowest * widest
+        if getattr(errors.target, g) <= 1.01 * JOINT.min_prior_share * widest
     ]
     none = [group for group in none if group != "delay" or not errors.target.late]
     kept = {name: value for name, value in errors.values.items() if group_of(name) not in none}
@@ -370,7 +372,7 @@ def _without_negligible_groups(found: Fit) -> Fit:
 def with_all_groups(search: Search, errors: Effect) -> Effect:
     """The nominal errors with all groups; those that were dropped start from zero with their original priors."""
     before = search.prior
-    closed = {g: getattr(before, g) for g, _ in JOINT.widest if not getattr(errors.target, g)}
+    closed = {g: getattr(before, g) for g, _ in JOINT.max_prior_std if not getattr(errors.target, g)}
     return nominal_errors(search.rig, replace(errors.target, **closed), errors.values)
 
 
@@ -385,13 +387,17 @@ def with_all_errors(search: Search, found: Fit) -> Fit:
     if errors is None:
         return found
     points, groups = _points_of(search.rig, found.effects), replace(search, by_mode=errors.target.by_mode).prior.groups
-    closed = {g: JOINT.narrowest * size for g, size in JOINT.widest if g in set(groups) - set(errors.target.groups)}
-    target = replace(errors.target, waves=JOINT.last_waves, points=points, **closed)
+    closed = {
+        g: JOINT.min_prior_share * size
+        for g, size in JOINT.max_prior_std
+        if g in set(groups) - set(errors.target.groups)
+    }
+    target = replace(errors.target, waves=JOINT.final_waves, points=points, **closed)
     all_errors = nominal_errors(search.rig, target, errors.values)
     effects = tuple(all_errors if e is errors else e for e in found.effects)
     if not errors.target.shape or not points:
         return replace(found, effects=effects)
-    data = search.data.finely(SELECTION.fine)
+    data = search.data.finely(SELECTION.substeps)
     power = _residual_level(search.rig, effects, data)
     fitted = _fit_at_level(search, effects, data, power, Chord(), is_last=True)
     return evaluated(search, fitted, data.substeps).fit
@@ -424,13 +430,13 @@ def with_input_noise(search: Search, fitted: Fit, sensor_noise: np.ndarray) -> S
         return None
     noisy = best.with_input_noise(rig, share)
     white = evaluated(noisy, fitted).fit
-    if INPUTS.white < white.cost < INPUTS.over_fitted * fitted.cost:
+    if INPUTS.max_mean_square < white.cost < INPUTS.over_fitted_share * fitted.cost:
         fitted = white = fit_jointly(noisy, fitted.effects[:-1], fitted.effects[-1]).fit
         rig = apply_all(search.rig, fitted.effects)
         residuals = search.data.differences(rig)
-    if white.cost > INPUTS.white:
+    if white.cost > INPUTS.max_mean_square:
         return None
-    for _ in range(INPUTS.rounds):  # sensor noise from the power of the innovations
+    for _ in range(INPUTS.noise_updates):  # sensor noise from the power of the innovations
         best = best.with_noise(best.data.noise * np.sqrt(white.cost_by_channel.mean(axis=0)))
         noisy = best.with_input_noise(rig, likeliest_share(rig, best.data, residuals).share)
         white = evaluated(noisy, fitted).fit
@@ -491,7 +497,7 @@ def _fitted_from_zero(search: Search, effects: Sequence[Effect]) -> JointFit:
     if interpolated is not ahead:
         ahead, zero_errors = interpolated, nominal_errors(search.rig, replace(search.prior, interpolated=True))
     found = fit_jointly(search, ahead.effects[:-1], ahead.effects[-1])
-    if search.by_mode or found.excess(found.noise_power) < STEPWISE.astray * float(search.nominal.mean()):
+    if search.by_mode or found.excess(found.noise_power) < STEPWISE.diverged_share * float(search.nominal.mean()):
         return found
     return min(found, fit_jointly(search, effects, zero_errors), key=lambda s: s.fit.cost)
 
@@ -501,8 +507,8 @@ def _interpolated(search: Search, ahead: Fit) -> Fit:
     *effects, errors = ahead.effects
     delays = in_group(errors.values, "delay")
     is_late = any(effect.kind in TIMING for effect in effects)
-    may_be_late = is_late or max(map(abs, delays.values()), default=0.0) > JOINT.surely_late
-    if not may_be_late and (effects or ahead.cost < JOINT.straight):
+    may_be_late = is_late or max(map(abs, delays.values()), default=0.0) > JOINT.certain_delay
+    if not may_be_late and (effects or ahead.cost < JOINT.interpolation_residual):
         return ahead
     prior = replace(search.prior, interpolated=True)
     interpolated = _fitted_ahead(search, effects, nominal_errors(search.rig, prior, delays))
@@ -519,8 +525,8 @@ def _fitted_ahead(search: Search, effects: Sequence[Effect], errors: Effect) -> 
         return fit(search.rig, sets, search.ahead, iterations=JOINT.iterations, workers=search.workers, chord=Chord())
 
     found = on((*effects, errors))
-    for _ in range(JOINT.anew - 1):
-        if found.falling < JOINT.still:
+    for _ in range(JOINT.max_fits_ahead - 1):
+        if found.falling < JOINT.least_decrease_ahead:
             break
         found = on(found.effects)
     return found
@@ -528,7 +534,7 @@ def _fitted_ahead(search: Search, effects: Sequence[Effect], errors: Effect) -> 
 
 def surely_late(errors: Effect) -> Effect:
     """The nominal errors with no accelerometer assigned to a side of the input steps, except the clearly late ones."""
-    late = tuple(name for name in errors.target.late if errors.values[f"delay_{name}"] > JOINT.surely_late)
+    late = tuple(name for name in errors.target.late if errors.values[f"delay_{name}"] > JOINT.certain_delay)
     return replace(errors, target=replace(errors.target, late=late, early=()))
 
 
@@ -560,7 +566,9 @@ def with_reading_sides(search: Search, errors: Effect, effects: Sequence[Effect]
         step, smooth = (search.ahead.by_channel(b - a).sum(axis=0) for a, b in ((at, after), (before, at)))
     powers = np.array([search.ahead.by_channel(residual).sum(axis=0) for residual in residuals.values()])
     rows = [
-        j for j, s in enumerate(search.rig.sensors) if s.name in accelerometers and step[j] > JOINT.jump * smooth[j]
+        j
+        for j, s in enumerate(search.rig.sensors)
+        if s.name in accelerometers and step[j] > JOINT.jump_ratio * smooth[j]
     ]
     best_delays = {search.rig.sensors[j].name: float(delays[powers[:, j].argmin()]) for j in rows}
     late = (*known_late, *(name for name, delay in best_delays.items() if delay > 0))

@@ -37,7 +37,9 @@ class Deviations:
     def is_sure(self) -> bool:
         """Whether the two records that are farthest apart differ by more than chance."""
         i, j = int(self.values.argmin()), int(self.values.argmax())
-        return bool(self.values[j] - self.values[i] > RECORDS.sure * np.hypot(self.spread[i], self.spread[j]))
+        return bool(
+            self.values[j] - self.values[i] > RECORDS.standard_errors * np.hypot(self.spread[i], self.spread[j])
+        )
 
 
 def deviations(search: Search, effects: Sequence[Effect], parameter: str) -> Deviations | None:
@@ -54,7 +56,7 @@ def deviations(search: Search, effects: Sequence[Effect], parameter: str) -> Dev
     names = [record.name for record in data.records]
     ends = np.cumsum([record.outputs.size for record in data.counted])[:-1]
     residuals = []  # by deviation tried, by record
-    for deviation in RECORDS.tried:
+    for deviation in RECORDS.deviations:
         residual = finite_residual(differing(rig, parameter, dict.fromkeys(names, deviation)), (), data)
         if residual is None:
             return None
@@ -72,8 +74,8 @@ def deviations(search: Search, effects: Sequence[Effect], parameter: str) -> Dev
 
 
 def _parabola_minimum(costs: Floats) -> tuple[float, float]:
-    """Minimum (position, value) of the parabola through the least cost at `RECORDS.tried` and its neighbours."""
-    tried = np.array(RECORDS.tried)
+    """Minimum (position, value) of the parabola through the least cost at `RECORDS.deviations` and its neighbours."""
+    tried = np.array(RECORDS.deviations)
     i = int(np.clip(costs.argmin(), 1, tried.size - 2))
     x = tried[i - 1 : i + 2]
     curve = np.polyfit(x, costs[i - 1 : i + 2], 2)
@@ -83,8 +85,8 @@ def _parabola_minimum(costs: Floats) -> tuple[float, float]:
 
 def _standard_error(residuals: Sequence[Floats], n_outputs: int) -> float:
     """Standard error of a record's deviation, from its residuals (n_values,) at each deviation tried."""
-    i = int(np.clip(np.argmin([r @ r for r in residuals]), 1, len(RECORDS.tried) - 2))
-    along = (residuals[i + 1] - residuals[i - 1]) / (RECORDS.tried[i + 1] - RECORDS.tried[i - 1])
+    i = int(np.clip(np.argmin([r @ r for r in residuals]), 1, len(RECORDS.deviations) - 2))
+    along = (residuals[i + 1] - residuals[i - 1]) / (RECORDS.deviations[i + 1] - RECORDS.deviations[i - 1])
     # by time, all sensors together
     gradient = (along * residuals[i]).reshape(n_outputs, -1).sum(axis=0)
     blocks = np.array([block.sum() for block in np.array_split(gradient, INTERVALS.blocks)])
@@ -98,8 +100,8 @@ def _varying_parameter(search: Search, step: JointFit) -> Deviations | None:
     noise = float(step.noise_power.mean())
     candidates = [deviations(search, step.fit.effects, parameter) for parameter in varying_parameters(search.rig)]
     sure = [d for d in candidates if d is not None and d.is_sure]
-    promising = [d for d in sure if d.in_common - d.left > RECORDS.enough * (d.in_common - noise)]
-    return min(promising, key=lambda d: d.left * (RECORDS.clearly if d is candidates[0] else 1.0), default=None)
+    promising = [d for d in sure if d.in_common - d.left > RECORDS.least_removed_share * (d.in_common - noise)]
+    return min(promising, key=lambda d: d.left * (RECORDS.max_ratio if d is candidates[0] else 1.0), default=None)
 
 
 def with_record_deviations(before: Stepwise) -> Stepwise | None:
@@ -132,7 +134,7 @@ def with_record_deviations(before: Stepwise) -> Stepwise | None:
     if (
         with_deviations.is_sufficient
         or with_deviations.by_singles()
-        or with_deviations.nearest.excess(noise) < RECORDS.half * nearest.excess(noise)
+        or with_deviations.nearest.excess(noise) < RECORDS.max_residual * nearest.excess(noise)
     ):
         with_deviations.run()
         return with_deviations
@@ -151,7 +153,7 @@ def with_mode_errors(before: Stepwise) -> Stepwise | None:
     nearest = before.nearest
     if before.at_first.prior.shape:  # errors of each mode were included from the start
         return None
-    if nearest.excess(nearest.noise_power) > STEPWISE.of_modes * float(before.search.nominal.mean()):
+    if nearest.excess(nearest.noise_power) > STEPWISE.mode_error_share * float(before.search.nominal.mean()):
         return None
     before.search.progress("errors of each mode", 0.5)
     with_modes = Stepwise(replace(before.at_first, by_mode=True), before.ahead)
@@ -168,7 +170,10 @@ def with_mode_errors(before: Stepwise) -> Stepwise | None:
     else:
         refitted = fit_from_zero(with_modes.search, nearest.effects)
         excess = nearest.excess(nearest.noise_power)
-        if before.has_plausible_errors and refitted.excess(refitted.noise_power) > STEPWISE.halved * excess:
+        if (
+            before.has_plausible_errors
+            and refitted.excess(refitted.noise_power) > STEPWISE.mode_error_residual * excess
+        ):
             return None
         with_modes.known = [refitted] if len(refitted.effects) == 1 else []
     if not with_modes.by_singles():

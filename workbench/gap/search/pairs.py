@@ -46,20 +46,26 @@ class Pairs:
         pairs = cls(search)
         if not search.is_over:
             search.progress("all pairs at once", 0.4)
-            pairs.explain = pairs._add_and_check(fitted_ahead(search, screened.likeliest_pairs(SELECTION.tried)))
+            pairs.explain = pairs._add_and_check(
+                fitted_ahead(search, screened.likeliest_pairs(SELECTION.fits_to_one_record))
+            )
         return pairs
 
     def with_a_third(self) -> bool:
         """Whether the best pair and a third effect explain the records; tried if the pair's residual allows for one."""
         search, found = self.search, self.found
-        if not found or not search.near(found[0], PAIRS.most) or search.near(found[0], SEARCH.negligible):
+        if (
+            not found
+            or not search.near(found[0], PAIRS.max_residual_share)
+            or search.near(found[0], SEARCH.negligible_share)
+        ):
             return False
         search.progress("the best pair and a third effect", 0.45)
         pair = found[0].effects
         if self._explained_with_one_more(pair):
             return True
         best = self.found[0]
-        if len(best.effects) <= len(pair) or not search.near(best, PAIRS.very_near):
+        if len(best.effects) <= len(pair) or not search.near(best, PAIRS.near_share):
             return False
         # given the third effect, one of the two may have to be replaced
         return self._explained_with_one_more(tuple(_by_contribution(search, best)[:-1]))
@@ -78,12 +84,12 @@ class Pairs:
         if self.explain or not self.ahead or search.is_over:
             return False
         pair = self.ahead[0]
-        most = min(PAIRS.most * (search.nominal_ahead - 1.0), PAIRS.nearer * (single - 1.0))
+        most = min(PAIRS.max_residual_share * (search.nominal_ahead - 1.0), PAIRS.improvement_ratio * (single - 1.0))
         if pair.cost - 1.0 > most:
             return False
         search.progress("three effects at once", 0.45)
         three = one_more(search, pair.effects, search.reconstruction_with(pair.effects))
-        if not three or three[0].cost - 1.0 > PAIRS.nearer * (pair.cost - 1.0):
+        if not three or three[0].cost - 1.0 > PAIRS.improvement_ratio * (pair.cost - 1.0):
             return False
         for two in list(each_left_out(three[0].effects)):
             three = [*three, *one_more(search, two, search.reconstruction_with(two))]
@@ -106,7 +112,7 @@ class Pairs:
             best = self.ahead[0]
             if self.with_any(_by_contribution(self.search, best)):
                 return True
-            if self.ahead[0].cost > PAIRS.nearer * best.cost:
+            if self.ahead[0].cost > PAIRS.improvement_ratio * best.cost:
                 break
         return self._from_other_places()
 
@@ -124,7 +130,7 @@ class Pairs:
 
     def decision(self, start: Fit) -> Decision:
         """The decision based on the pairs; `start` is the fit without effects."""
-        likeliest = best_of_each(self.found or [start])[: PAIRS.named]
+        likeliest = best_of_each(self.found or [start])[: PAIRS.max_sets]
         explaining = [f for f in likeliest if self.search.explains(f)]
         if explaining:
             plain = plainest(self.search, explaining)
@@ -137,13 +143,13 @@ class Pairs:
         """Fit the best one-step-ahead pairs to whole records and refine them; whether one explains the records."""
         self.ahead = sorted((*self.ahead, *ahead), key=lambda f: f.cost)
         domain = self.search.rig.modes.domain
-        enough = max(SELECTION.promising, SELECTION.promising_share * self.search.nominal_ahead)
+        enough = max(SELECTION.max_residual_ahead, SELECTION.max_share_ahead * self.search.nominal_ahead)
         promising = [f for f in ahead if f.cost < enough]
         fresh = [f for f in promising if not any(in_one_minimum(f, other, domain) for other in self.continued)]
-        most = PAIRS.more if self.found else PAIRS.finalists
+        most = PAIRS.finalists_beside if self.found else PAIRS.finalists
         self.continued = [*self.continued, *fresh[:most]]
         self._add(on_whole_records(self.search, fresh, most))
-        near = [pair for pair in self.found[: PAIRS.tried_further] if not _was_finished(pair, self.ended)]
+        near = [pair for pair in self.found[: PAIRS.relocated_pairs] if not _was_finished(pair, self.ended)]
         taken = _finished(self.search, near)
         self.ended = [*self.ended, *near, *taken]
         self._add(taken)
@@ -154,17 +160,19 @@ class Pairs:
         search = self.search
         if search.is_over:
             return False
-        likeliest = best_of_each(self.found)[: PAIRS.tried_further]
-        fresh = [f for f in likeliest if search.near(f, PAIRS.very_near) and not _was_finished(f, self.relocated_pairs)]
+        likeliest = best_of_each(self.found)[: PAIRS.relocated_pairs]
+        fresh = [
+            f for f in likeliest if search.near(f, PAIRS.near_share) and not _was_finished(f, self.relocated_pairs)
+        ]
         elsewhere = search.in_parallel(relocated, fresh)
         self.relocated_pairs = [*self.relocated_pairs, *fresh, *elsewhere]
         self._add(elsewhere)
         if any(search.explains(pair) for pair in elsewhere):
             return True
-        if not self.found or not search.near(self.found[0], RANDOM.near):
+        if not self.found or not search.near(self.found[0], RANDOM.max_residual_share):
             return False
         best = self.found[0]
-        if not all(best.cost - 1.0 < PAIRS.nearer * (miss.cost - 1.0) for miss in self.near_misses):
+        if not all(best.cost - 1.0 < PAIRS.improvement_ratio * (miss.cost - 1.0) for miss in self.near_misses):
             return False
         self.near_misses = [*self.near_misses, best]
         return self.with_any(best.effects[::-1])
@@ -176,7 +184,7 @@ class Pairs:
 
 def _reconstruction_with(search: Search, effect: Effect) -> ForceReconstruction:
     """The force reconstructed with the effect, or without it if the simulation diverges with this effect alone."""
-    astray = cost_of(search.rig, (effect,), search.data) > PAIRS.astray * search.nominal.mean()
+    astray = cost_of(search.rig, (effect,), search.data) > PAIRS.diverged_cost * search.nominal.mean()
     return search.reconstruction_with(() if astray else (effect,))
 
 
@@ -194,12 +202,14 @@ def _are_nearly_equal(one: Effect, other: Effect) -> bool:
     if one.label != other.label or (isinstance(one.at, str | Between) and one.at != other.at):
         return False
     numbers = [name for name, value in one.values.items() if isinstance(value, float)]
-    return all(np.isclose(one.values[n], other.values[n], rtol=PAIRS.moved) for n in numbers)
+    return all(np.isclose(one.values[n], other.values[n], rtol=PAIRS.parameter_change) for n in numbers)
 
 
 def _was_finished(pair: Fit, ended: Sequence[Fit]) -> bool:
     """Whether the same set was refined before from nearly the same cost."""
-    return any(pair.key == other.key and other.cost - 1.0 < PAIRS.same * (pair.cost - 1.0) for other in ended)
+    return any(
+        pair.key == other.key and other.cost - 1.0 < PAIRS.same_minimum_ratio * (pair.cost - 1.0) for other in ended
+    )
 
 
 def _finished(search: Search, pairs: Sequence[Fit]) -> list[Fit]:
@@ -207,5 +217,5 @@ def _finished(search: Search, pairs: Sequence[Fit]) -> list[Fit]:
     ended = search.in_parallel(finished, pairs)
     if any(search.explains(pair) for pair in ended):
         return ended
-    near = [pair for pair in ended if search.near(pair, PAIRS.very_near)]
+    near = [pair for pair in ended if search.near(pair, PAIRS.near_share)]
     return [*search.in_parallel(simplified, near), *(pair for pair in ended if pair not in near)]

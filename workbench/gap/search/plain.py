@@ -87,7 +87,7 @@ def _one_uniform_error(
 
     An imperfect model has both, so they are no effect.
     """
-    most = both.cost + PLAIN.needless / search.data.n_values
+    most = both.cost + PLAIN.likelihood_ratio / search.data.n_values
     alone = [
         found for one in common if (found := _simplest_explaining(search, [(one, *kept)], step)) and found.cost < most
     ]
@@ -99,7 +99,7 @@ def _at_transducers(errors: Effect) -> Iterator[tuple[Effect, ...]]:
     prior = errors.target
     sides = {"late": prior.late, "early": prior.early, "interpolated": prior.interpolated}
     timing = NominalPrior(sample_time=prior.sample_time, waves=prior.waves, **sides)
-    if prior.delay > ERRORS.smallest_delay or prior.late:
+    if prior.delay > ERRORS.min_delay or prior.late:
         timing = replace(timing, delay=prior.delay)
     for kept in dict.fromkeys((timing, replace(timing, gain=prior.gain, place=prior.place))):
         values = in_group(errors.values, *kept.groups)
@@ -120,20 +120,22 @@ def _simplest_explaining(search: Search, sets: Sequence[tuple[Effect, ...]], ste
     """
 
     def briefly(effects: Sequence[Effect]) -> Fit:
-        found = fit(search.rig, effects, search.quick, iterations=PLAIN.briefly)
-        extra = PLAIN.plainly - PLAIN.briefly
-        if not found.falling or promise(found, extra) > PLAIN.near:
+        found = fit(search.rig, effects, search.quick, iterations=PLAIN.first_iterations)
+        extra = PLAIN.iterations - PLAIN.first_iterations
+        if not found.falling or promise(found, extra) > PLAIN.max_residual:
             return found
         return fit(search.rig, found.effects, search.quick, iterations=extra)
 
     on_quick = search.workers.map(briefly, list(sets))
-    promising = [f for f in on_quick if f.cost < PLAIN.near and not _is_surely_worse(search, f, step, search.quick)]
-    fine_data, best = search.data.finely(SELECTION.fine), None
+    promising = [
+        f for f in on_quick if f.cost < PLAIN.max_residual and not _is_surely_worse(search, f, step, search.quick)
+    ]
+    fine_data, best = search.data.finely(SELECTION.substeps), None
     for candidate in sorted(promising, key=lambda f: f.n_parameters):
         if best is not None and set(best.labels) <= set(candidate.labels):
             continue
         effects = _with_reading_sides(search, candidate.effects)
-        found = fit(search.rig, effects, fine_data, iterations=PLAIN.plainly)
+        found = fit(search.rig, effects, fine_data, iterations=PLAIN.iterations)
         extra = 0 if best is None else found.n_parameters - best.n_parameters
         explains = search.explains(found) and not _is_surely_worse(search, found, step, fine_data)
         if explains and (best is None or search.surely_better(found, best.cost, extra)):
@@ -180,7 +182,7 @@ def other_delay_causes(search: Search, found: Fit) -> Alternatives:
 
 def _explaining_instead(search: Search, found: Fit, effect: Effect, causes: Sequence[Effect]) -> list[Fit]:
     """The fits, with an effect replaced by each of some causes, that explain the records."""
-    others, fine_data = [e for e in found.effects if e is not effect], search.data.finely(SELECTION.fine)
+    others, fine_data = [e for e in found.effects if e is not effect], search.data.finely(SELECTION.substeps)
     fits = search.workers.map(lambda cause: fit(search.rig, (*others, cause), fine_data), causes)
     return [f for f in fits if search.explains(f)]
 
@@ -199,18 +201,21 @@ def few_with_uniform_errors(search: Search, step: JointFit, most: int) -> Fit | 
         if search.is_over:
             return None
         ahead = one_more(search, best.effects, search.reconstruction_with(best.effects))
-        fits = on_whole_records(search, ahead, PAIRS.more)
+        fits = on_whole_records(search, ahead, PAIRS.finalists_beside)
         if not fits:
             return None
-        is_better = fits[0].cost - 1.0 < PAIRS.nearer * (best.cost - 1.0)
-        if not (is_better or ahead[0].cost < PAIRS.nearer * cost_of(search.rig, best.effects, search.ahead)):
+        is_better = fits[0].cost - 1.0 < PAIRS.improvement_ratio * (best.cost - 1.0)
+        if not (is_better or ahead[0].cost < PAIRS.improvement_ratio * cost_of(search.rig, best.effects, search.ahead)):
             return None
-        limiting_cases, cost_limit = contained(fits[0].effects, search.rig), (1.0 + SEARCH.significant) * fits[0].cost
+        limiting_cases, cost_limit = (
+            contained(fits[0].effects, search.rig),
+            (1.0 + SEARCH.significant_gain) * fits[0].cost,
+        )
         best = next((f for f in fits if f.key in limiting_cases and f.cost < cost_limit), fits[0])
         named = [effect for effect in best.effects if effect.kind not in UNIFORM]
         if any(is_plausible_error(effect, search) for effect in named):
             return None
-        if best.cost < PLAIN.near and search.explains(finished(search, best)):
+        if best.cost < PLAIN.max_residual and search.explains(finished(search, best)):
             fewer = (named, *each_left_out(named), *simpler_sets(named, search.rig))
             sets = [(*s, *some) for s in fewer for some in _subsets(NO_UNIFORM_ERROR)]
             found = _simplest_explaining(search, [s for s in sets if s], step)
@@ -231,15 +236,15 @@ def _with_one_linear_effect(
     linear_kinds = tuple(kind for kind in search.catalogue if is_linear_structural(kind))
     if not linear_kinds:
         return None
-    start = fit(search.rig, effects, search.quick, iterations=PLAIN.plainly)
+    start = fit(search.rig, effects, search.quick, iterations=PLAIN.iterations)
     # the residual is too small for another effect; with input noise it is weighted down, so its size does not decide
-    if not search.logged and start.cost < 1.0 + STEPWISE.no_gap:
+    if not search.logged and start.cost < 1.0 + STEPWISE.noise_excess:
         return None
     given = start.effects
     screened = Screening.of(
         replace(search, catalogue=linear_kinds), given, search.reconstruction_with(given)
     ).likeliest()
-    likeliest = first_of_each(screened, lambda effect: effect.kind)[: PLAIN.likeliest]
+    likeliest = first_of_each(screened, lambda effect: effect.kind)[: PLAIN.additional_kinds]
     beside = tuple(dict.fromkeys(((), common)))
     sets = [(*given, effect, *some) for effect in likeliest for some in beside]
     found = _simplest_explaining(search, sets, step)
@@ -249,17 +254,19 @@ def _with_one_linear_effect(
     if found is None:
         return None
     others = [e for e in found.effects if e.kind in UNIFORM or any(e.label == other.label for other in given)]
-    without = fit(search.rig, others, search.data.finely(SELECTION.fine), iterations=PLAIN.plainly)
+    without = fit(search.rig, others, search.data.finely(SELECTION.substeps), iterations=PLAIN.iterations)
     extra = found.n_parameters - without.n_parameters
-    is_justified = without.cost - found.cost > SEARCH.significant and search.surely_better(found, without.cost, extra)
+    is_justified = without.cost - found.cost > SEARCH.significant_gain and search.surely_better(
+        found, without.cost, extra
+    )
     return found if is_justified else None
 
 
 def _elsewhere(search: Search, sets: Sequence[tuple[Effect, ...]], start: Fit) -> list[Effect]:
     """The last effect of the best set at other places; none unless it leaves little of what the start does."""
-    fits = search.workers.map(lambda s: fit(search.rig, s, search.quick, iterations=PLAIN.plainly), sets)
+    fits = search.workers.map(lambda s: fit(search.rig, s, search.quick, iterations=PLAIN.iterations), sets)
     best = min(fits, key=lambda f: f.cost, default=start)
-    if best is start or best.cost - 1.0 > PAIRS.nearer * (start.cost - 1.0):
+    if best is start or best.cost - 1.0 > PAIRS.improvement_ratio * (start.cost - 1.0):
         return []
     effect = best.effects[-1]
     if effect.at is None:

@@ -52,7 +52,7 @@ class Screening:
         before = finite_residual(search.rig, (*given, *search.held), unprojected)
         if before is None:
             return cls((), np.zeros((0, 0)), np.zeros(0), np.zeros(0), np.zeros(0), search.rig.modes.domain)
-        every = slice(None, None, max(1, before.size // SCREENING.most_values))
+        every = slice(None, None, max(1, before.size // SCREENING.max_values))
 
         starts = _starts(search, given, reconstruction)
         left = before.copy()
@@ -72,7 +72,9 @@ class Screening:
 
         for i in {start.kind: i for i, start in enumerate(starts) if start.kind not in CATALOGUE}.values():
             moved_by(range(i, i + 1))  # a law of the user's own is compiled here, not in each process
-        at_once = [range(i, min(i + SCREENING.at_once, len(starts))) for i in range(0, len(starts), SCREENING.at_once)]
+        at_once = [
+            range(i, min(i + SCREENING.batch_size, len(starts))) for i in range(0, len(starts), SCREENING.batch_size)
+        ]
         usable_starts = [is_usable for some in search.workers.map(moved_by, at_once) for is_usable in some]
         usable = [i for i, is_usable in enumerate(usable_starts) if is_usable]
         for row, i in enumerate(usable):  # unusable rows are overwritten
@@ -135,7 +137,7 @@ class Screening:
             alike: Flags = names[:, None] == names
             return alike
         at = np.array([[start.values.get(name, 0.0) for name in self.domain.coordinates] for start in self.starts])
-        beside: Flags = np.linalg.norm(at[:, None] - at, axis=2) <= SEARCH.elsewhere * self.domain.size
+        beside: Flags = np.linalg.norm(at[:, None] - at, axis=2) <= SEARCH.distinct_distance * self.domain.size
         return beside
 
     def _pair_costs(self) -> np.ndarray:
@@ -158,7 +160,7 @@ def _bounds(start: Effect) -> tuple[float, float]:
     """Bounds of the strength of an effect, in units of the start's."""
     if not start.values:
         return 1.0, 1.0
-    return (-SCREENING.stronger if start.kind.signed else SCREENING.weaker), SCREENING.stronger
+    return (-SCREENING.max_strength if start.kind.signed else SCREENING.min_strength), SCREENING.max_strength
 
 
 def _starts(search: Search, given: tuple[Effect, ...], reconstruction: ForceReconstruction) -> list[Effect]:
@@ -210,7 +212,7 @@ def one_more(
     screened = Screening.of(search, given, reconstruction) if screened is None else screened
     chosen: list[Effect] = []
     for effect in screened.likeliest():
-        if sum(effect.kind is other.kind for other in chosen) < SELECTION.targets_a_kind:
+        if sum(effect.kind is other.kind for other in chosen) < SELECTION.targets_per_kind:
             chosen.append(effect)
     found = fitted_ahead(search, [(*given, effect) for effect in chosen])
     if not (search.held and found):
@@ -232,7 +234,9 @@ def _at_likely_places(found: Sequence[Fit], screened: Screening) -> list[Effect]
     ]
     if isinstance(screened.domain, NamedPoints):
         return of_transducer
-    likeliest = [f.effects[-1] for f in best_of_each_kind(found) if is_linear(f.effects[-1])][: SELECTION.exchanged]
+    likeliest = [f.effects[-1] for f in best_of_each_kind(found) if is_linear(f.effects[-1])][
+        : SELECTION.exchanged_effects
+    ]
     linear = {effect.kind: effect for effect in reversed(starts) if is_linear(effect)}
     there = [e.moved_to(one.at) for one in likeliest for e in linear.values() if e.kind is not one.kind]
     return [*there, *of_transducer]
@@ -253,11 +257,13 @@ def fitted_ahead(search: Search, sets: Sequence[tuple[Effect, ...]]) -> list[Fit
         return fit(search.rig, effects, data, held=search.held, iterations=iterations, tolerance=1e-4)
 
     with search.workers.pool(ahead) as share:
-        tried = share([(effects, True, 2) for effects in sets[: SELECTION.tried]])
-        likely = sorted(tried, key=promise)[: SELECTION.likely]
+        tried = share([(effects, True, 2) for effects in sets[: SELECTION.fits_to_one_record]])
+        likely = sorted(tried, key=promise)[: SELECTION.fits_to_two_records]
         fits = distinct_minima(search, sorted(share([(f.effects, False, 3) for f in likely]), key=promise))
         falling = [
-            f for f in fits[: SELECTION.likeliest] if f.falling and promise(f) < SELECTION.far_behind * promise(fits[0])
+            f
+            for f in fits[: SELECTION.fits_until_convergence]
+            if f.falling and promise(f) < SELECTION.max_cost_ratio * promise(fits[0])
         ]
         longer = share([(f.effects, False, 8) for f in falling])
     return distinct_minima(search, sorted((*longer, *(f for f in fits if f not in falling)), key=lambda f: f.cost))
@@ -281,30 +287,30 @@ def on_whole_records(
         ahead: one-step-ahead fits, best first.
         most: number of fits, at most; those of a much higher cost are left out.
         to_cost: cost that a fit must reach to be useful; fits that will not are stopped early.
-        at_first: iterations before that is predicted; None for `SELECTION.at_first`.
+        at_first: iterations before that is predicted; None for `SELECTION.first_iterations`.
     """
-    at_first = SELECTION.at_first if at_first is None else at_first
-    close = [f for f in ahead[:most] if f.cost < SELECTION.close * ahead[0].cost]
+    at_first = SELECTION.first_iterations if at_first is None else at_first
+    close = [f for f in ahead[:most] if f.cost < SELECTION.max_ratio_ahead * ahead[0].cost]
     simpler = contained(close[0].effects, search.rig) if close else set()
     first = [f for f in close if f is close[0] or f.key in simpler]
     fits = search.workers.map(lambda f: by_continuation(search, f.effects, at_first), first)
     remaining = [f for f in close if f not in first]
     if any(search.explains(f) for f in fits):
-        remaining = [f for f in remaining if f.cost < ahead[0].cost + SEARCH.alternative]
+        remaining = [f for f in remaining if f.cost < ahead[0].cost + SEARCH.alternative_margin]
     others = _without_generalisations(search, fits, remaining)
     more = search.workers.map(lambda f: by_continuation(search, f.effects, at_first), others)
     fits = sorted((*fits, *more), key=promise)
     fits = _without_generalisations(search, fits, fits)
-    to_cost = min([to_cost, *(f.cost + SEARCH.alternative for f in fits if search.explains(f))])
-    running = [f for f in fits if f.falling and promise(f) < SELECTION.running * promise(fits[0])]
-    running = [f for f in running if promise(f, SEARCH.further) < to_cost]
+    to_cost = min([to_cost, *(f.cost + SEARCH.alternative_margin for f in fits if search.explains(f))])
+    running = [f for f in fits if f.falling and promise(f) < SELECTION.max_predicted_ratio * promise(fits[0])]
+    running = [f for f in running if promise(f, SEARCH.extrapolated_iterations) < to_cost]
     longer = search.workers.map(lambda f: whole(search, f.effects, 25), running)
     return sorted((*longer, *(f for f in fits if f not in running)), key=lambda f: f.cost)
 
 
 def _without_generalisations(search: Search, fits: Sequence[Fit], others: Sequence[Fit]) -> list[Fit]:
     """The others without those that have a limiting case among the fits at the noise floor."""
-    enough = {f.key for f in fits if f.cost < 1.0 + SEARCH.significant and search.explains(f)}
+    enough = {f.key for f in fits if f.cost < 1.0 + SEARCH.significant_gain and search.explains(f)}
     return [f for f in others if enough.isdisjoint(contained(f.effects, search.rig))]
 
 
@@ -322,12 +328,12 @@ def by_continuation(search: Search, effects: tuple[Effect, ...], iterations: int
     rig = apply_all(search.rig, effects)
     if is_stepped(rig) and not search.held and search.data.observer is None:
         for loose in SELECTION.continuation:
-            data = search.data.one_step_ahead(rig, loose).finely(SELECTION.fine)
+            data = search.data.one_step_ahead(rig, loose).finely(SELECTION.substeps)
             held = fit(search.rig, effects, data, iterations=8, tolerance=1e-4)
             effects = held.effects
             if (
-                held.cost > SELECTION.promising
-                or cost_of(search.rig, effects, search.data.finely(SELECTION.fine)) < SELECTION.at_hand
+                held.cost > SELECTION.max_residual_ahead
+                or cost_of(search.rig, effects, search.data.finely(SELECTION.substeps)) < SELECTION.convergence_residual
             ):
                 break
     return whole(search, effects, iterations)
@@ -335,5 +341,5 @@ def by_continuation(search: Search, effects: tuple[Effect, ...], iterations: int
 
 def whole(search: Search, effects: tuple[Effect, ...], iterations: int) -> Fit:
     """The set fitted to whole records, with fine substeps."""
-    data = search.data.finely(SELECTION.fine)
+    data = search.data.finely(SELECTION.substeps)
     return fit(search.rig, effects, data, held=search.held, iterations=iterations)

@@ -89,7 +89,11 @@ class Search:
             return False
         residual_power = candidate.cost_by_channel.mean(axis=1)
         per_record = self.data.counted[0].outputs.size
-        slack = SEARCH.slack + 5.0 * np.sqrt(2.0 / per_record) + SEARCH.integration_share * self.nominal.mean(axis=1)
+        slack = (
+            SEARCH.noise_tolerance
+            + 5.0 * np.sqrt(2.0 / per_record)
+            + SEARCH.integration_error * self.nominal.mean(axis=1)
+        )
         slack = slack + candidate.stepping
         return bool(
             (residual_power < 1.0 + slack).all()
@@ -99,8 +103,8 @@ class Search:
     @property
     def cost_limit(self) -> float:
         """Largest cost of a set that explains the records."""
-        slack = max(SEARCH.slack, SEARCH.chance * np.sqrt(2.0 / self.data.n_values))
-        return float(1.0 + slack + SEARCH.integration_share * self.nominal.mean())
+        slack = max(SEARCH.noise_tolerance, SEARCH.noise_deviations * np.sqrt(2.0 / self.data.n_values))
+        return float(1.0 + slack + SEARCH.integration_error * self.nominal.mean())
 
     def clustered(self, effects: Sequence[Effect]) -> bool:
         """Whether nonlinear effects cluster at one place: two of one kind, or three of any."""
@@ -115,12 +119,13 @@ class Search:
     def surely_better(self, candidate: Fit, than: float, extra: int) -> bool:
         """Whether the gain in likelihood justifies `extra` more parameters."""
         n = self.data.n_values
-        return bool(n * (than - candidate.cost) > SEARCH.sure + extra * np.log(n))
+        return bool(n * (than - candidate.cost) > SEARCH.likelihood_ratio + extra * np.log(n))
 
     def significant(self, candidate: Fit, than: float) -> bool:
         """Whether a fit improves on a cost surely, and by more than the imperfection of any model."""
         return (
-            self.surely_better(candidate, than, candidate.n_parameters) and than - candidate.cost > SEARCH.significant
+            self.surely_better(candidate, than, candidate.n_parameters)
+            and than - candidate.cost > SEARCH.significant_gain
         )
 
     def distinguishes(self, better: float, cost: float, extra: int) -> bool:
@@ -136,7 +141,7 @@ class Search:
             n_values: number of measured values; None for those of all records.
         """
         n = self.data.n_values if n_values is None else n_values
-        return gain > SEARCH.trifle and n * gain > SEARCH.sure + extra * np.log(n)
+        return gain > SEARCH.least_gain and n * gain > SEARCH.likelihood_ratio + extra * np.log(n)
 
     def near(self, candidate: Fit, share: float) -> bool:
         """Whether the residual power of a fit above the noise is below this share of the gap's."""
@@ -198,7 +203,9 @@ class Search:
 
     def without_clipped(self) -> "Search":
         """The same search without sensors that clip or round coarsely, whose errors would pass for a force."""
-        kept = [j for j, s in enumerate(self.rig.sensors) if np.isinf(s.limit) and s.step < SEARCH.coarse * s.noise_std]
+        kept = [
+            j for j, s in enumerate(self.rig.sensors) if np.isinf(s.limit) and s.step < SEARCH.coarse_step * s.noise_std
+        ]
         if not kept or len(kept) == len(self.rig.sensors):
             return self
         sensors = tuple(self.rig.sensors[j] for j in kept)
@@ -315,7 +322,7 @@ def first_of_each(items: Iterable[Candidate], key: Callable[[Candidate], Hashabl
 
 def apart(one: Effect, other: Effect, domain: Domain) -> bool:
     """Whether two effects are far enough apart for different local minima; those without a place always are."""
-    return one.at is None or domain.separation(one.at, other.at) > SEARCH.elsewhere
+    return one.at is None or domain.separation(one.at, other.at) > SEARCH.distinct_distance
 
 
 def in_one_minimum(one: Fit, other: Fit, domain: Domain) -> bool:
@@ -327,7 +334,7 @@ def in_one_minimum(one: Fit, other: Fit, domain: Domain) -> bool:
     if one.key != other.key:
         return False
     both = ((here.at, there.at) for here, there in zip(in_order(one), in_order(other), strict=True))
-    return all(here is None or domain.separation(here, there) < SEARCH.same_place for here, there in both)
+    return all(here is None or domain.separation(here, there) < SEARCH.same_distance for here, there in both)
 
 
 def _sort_key(where: Any) -> tuple[Any, ...]:

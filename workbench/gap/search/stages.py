@@ -113,7 +113,7 @@ class Stages:
         the other uniform error surely explains more.
         """
         pairs, search = replace(self.screened_pairs), self.search
-        near = [effect for f in self.singles[:1] if search.near(f, PAIRS.most) for effect in f.effects]
+        near = [effect for f in self.singles[:1] if search.near(f, PAIRS.max_residual_share) for effect in f.effects]
         if not (pairs.explain or pairs.with_any(near)):
             return None
         decision = pairs.decision(self.start)
@@ -122,7 +122,7 @@ class Stages:
             return None
         missing = [effect for effect in NO_UNIFORM_ERROR if effect.kind not in {e.kind for e in effects}]
         if len(missing) == 1:  # an imperfect model has both uniform errors, and a damper may stand for one of damping
-            both = fit(search.rig, (*effects, *missing), search.data, iterations=ATTRIBUTION.together)
+            both = fit(search.rig, (*effects, *missing), search.data, iterations=ATTRIBUTION.joint_iterations)
             if search.surely_better(both, decision.best.cost, 1):
                 return None
         return self._if_significant(decision)
@@ -141,8 +141,8 @@ class Stages:
         """One effect and more noise than stated: fewer parameters than nominal errors that fit equally well."""
         search, stated, best = self.search, self.search.data.noise, self.singles[0] if self.singles else self.start
         under_errors = np.sqrt(self.stepwise.last.sensor_noise) * stated
-        noise = np.clip(search.noise_with(best), stated, (1.0 + ATTRIBUTION.a_tenth) ** 0.5 * under_errors)
-        if np.median(noise / stated) ** 2 < 1.0 + ATTRIBUTION.a_tenth:
+        noise = np.clip(search.noise_with(best), stated, (1.0 + ATTRIBUTION.tenth_louder) ** 0.5 * under_errors)
+        if np.median(noise / stated) ** 2 < 1.0 + ATTRIBUTION.tenth_louder:
             return None
         louder = search.with_noise(noise)
 
@@ -151,7 +151,7 @@ class Stages:
             return replace(candidate, cost=float(by_channel.mean()), cost_by_channel=by_channel)
 
         fits = [in_louder(f) for f in self.singles]
-        promising = [f for f in fits if louder.explains(f) or louder.near(f, ATTRIBUTION.very_near)]
+        promising = [f for f in fits if louder.explains(f) or louder.near(f, ATTRIBUTION.noise_share)]
         decision = _decide_on_singles(louder, in_louder(self.start), promising)[0] if promising else None
         if decision is None or decision.outcome != "explained":
             return None
@@ -161,7 +161,7 @@ class Stages:
         """Effects in the model with the modes that are missing, where these close most of the gap and not all of it."""
         search, best = self.search, self.singles[0] if self.singles else self.start
         missing = tuple(effect for effect in best.effects if effect.kind.adds_modes)
-        if not missing or missing != best.effects or not search.near(best, ATTRIBUTION.of_modes):
+        if not missing or missing != best.effects or not search.near(best, ATTRIBUTION.mode_share):
             return None
         if self.is_explained_by_one_beside_errors:
             return None
@@ -182,7 +182,7 @@ class Stages:
     def random_beside_effects(self) -> Decision | None:
         """A random disturbance beside stronger effects, or beside small errors of the model."""
         is_at_noise = self.is_explained_beside_errors and self.stepwise.is_noise_only
-        is_near_noise = min(f.cost for f in (self.start, *self.singles)) < 1.0 + STEPWISE.no_gap
+        is_near_noise = min(f.cost for f in (self.start, *self.singles)) < 1.0 + STEPWISE.noise_excess
         if is_at_noise or is_near_noise or self.search.is_over:
             return None
         random = random_with_effects(self.search, self.singles)
@@ -260,7 +260,7 @@ class Stages:
         for record, residual in zip(self.nominal.data.counted, self.nominal.residuals, strict=True):
             scale = record.outputs.std(axis=1, keepdims=True)
             noise_floor = float(((self.nominal.data.noise[:, None] / scale) ** 2).mean())
-            largest = max(self.search.tolerance**2, ATTRIBUTION.a_tenth * noise_floor)
+            largest = max(self.search.tolerance**2, ATTRIBUTION.tenth_louder * noise_floor)
             if float(((residual / scale) ** 2).mean()) - noise_floor > largest:
                 return False
         return self.search.tolerance > 0
@@ -273,14 +273,14 @@ class Stages:
 
     def _singles_on_whole_records(self) -> list[Fit]:
         """Single effects on whole records, best first."""
-        promising = [f for f in self.ahead if f.cost < SELECTION.promising] or self.ahead[:1]
+        promising = [f for f in self.ahead if f.cost < SELECTION.max_residual_ahead] or self.ahead[:1]
         self.search.progress("one effect, on whole records", 0.3)
         if not self.is_explained_by_none:
             return on_whole_records(self.search, promising, ATTRIBUTION.finalists)
         # only a significant gain matters, and there may be no effect at all
-        to_cost = self.start.cost - SEARCH.significant
+        to_cost = self.start.cost - SEARCH.significant_gain
         return on_whole_records(
-            self.search, promising, ATTRIBUTION.finalists, to_cost=to_cost, at_first=ATTRIBUTION.briefly
+            self.search, promising, ATTRIBUTION.finalists, to_cost=to_cost, at_first=ATTRIBUTION.first_iterations
         )
 
     @cached_property
@@ -366,7 +366,7 @@ def _decide_on_singles(search: Search, start: Fit, singles: list[Fit]) -> tuple[
     ended = _finished_best(search, good[:4])
     explaining = [f for f in ended if search.explains(f)]
     if not explaining:
-        near = [f for f in ended[:2] if search.near(f, RANDOM.near)]
+        near = [f for f in ended[:2] if search.near(f, RANDOM.max_residual_share)]
         moved = search.in_parallel(relocated, near)
         explaining = [f for f in moved if search.explains(f)]
         singles = sorted((*moved, *singles), key=lambda f: f.cost)
@@ -380,11 +380,13 @@ def _decide_on_singles(search: Search, start: Fit, singles: list[Fit]) -> tuple[
 
 def _finished_best(search: Search, fits: Sequence[Fit]) -> list[Fit]:
     """The fits; those that more iterations or finer substeps may bring to the noise floor are refined."""
-    promising = [f for f in fits if f.cost < ATTRIBUTION.far_behind * fits[0].cost]
+    promising = [f for f in fits if f.cost < ATTRIBUTION.max_cost_ratio * fits[0].cost]
     if fits and search.explains(fits[0]):
-        near = fits[0].cost + SEARCH.alternative
+        near = fits[0].cost + SEARCH.alternative_margin
         promising = [
-            f for f in promising if promise(f, SEARCH.further) < near or is_stepped(apply_all(search.rig, f.effects))
+            f
+            for f in promising
+            if promise(f, SEARCH.extrapolated_iterations) < near or is_stepped(apply_all(search.rig, f.effects))
         ]
     return [*search.in_parallel(finished, promising), *(f for f in fits if f not in promising)]
 
@@ -395,7 +397,7 @@ def _force_of_other_law(search: Search, reconstruction: ForceReconstruction) -> 
     Two effects at one place can fit many laws, so this comes before pairs are accepted. None if there is none.
     """
     search.progress("one force of a law beyond the catalogue", 0.35)
-    fits = _forces_of_other_laws(search, reconstruction, SELECTION.promising)
+    fits = _forces_of_other_laws(search, reconstruction, SELECTION.max_residual_ahead)
     return next((f for f in (_as_catalogue_kind(search, f) for f in fits) if search.explains(f)), None)
 
 
@@ -403,7 +405,7 @@ def _forces_of_other_laws(search: Search, reconstruction: ForceReconstruction, m
     """Forces at one point of a law beyond the catalogue, best first, that cost less than `most` one step ahead."""
     beyond = replace(search, catalogue=BEYOND)
     promising = [f for f in one_more(beyond, (), reconstruction) if f.cost < most]
-    return on_whole_records(beyond, promising, ATTRIBUTION.laws, to_cost=search.cost_limit)
+    return on_whole_records(beyond, promising, ATTRIBUTION.other_laws, to_cost=search.cost_limit)
 
 
 def _as_catalogue_kind(search: Search, law: Fit) -> Fit:
@@ -426,7 +428,7 @@ def _unless_other_law(search: Search, decision: Decision, reconstruction: ForceR
     if not effect.kind.nonlinear or effect.at is None:
         return decision
     search.progress("one force of a law beyond the catalogue", 0.9)
-    as_near = cost_of(search.rig, best.effects, search.ahead) + SEARCH.alternative
+    as_near = cost_of(search.rig, best.effects, search.ahead) + SEARCH.alternative_margin
     fits = _forces_of_other_laws(search, reconstruction.of_force_at(effect.at), as_near)
     other = [f for f in fits if in_catalogue(f.effects[0]) is None]
     sure = (f for f in other if search.explains(f) and search.surely_better(f, best.cost, best.n_parameters))

@@ -113,12 +113,12 @@ class Stepwise:
     @property
     def closes_gap(self) -> bool:
         """Whether the residual of the last set is at the noise floor, or a negligible share of the gap."""
-        return self.is_noise_only or self.unexplained < STEPWISE.explained
+        return self.is_noise_only or self.unexplained < STEPWISE.explained_share
 
     @property
     def is_noise_only(self) -> bool:
         """Whether the residual of the last set is at the noise floor of sensors and inputs."""
-        return self.last.is_near(self.last.noise_power, STEPWISE.no_gap)
+        return self.last.is_near(self.last.noise_power, STEPWISE.noise_excess)
 
     @property
     def _is_exhausted(self) -> bool:
@@ -138,7 +138,7 @@ class Stepwise:
     @property
     def is_sufficient(self) -> bool:
         """Whether the residual of the last set is too small to search for another effect."""
-        left = self.last.explains or (self.last.effects and self.unexplained < STEPWISE.further)
+        left = self.last.explains or (self.last.effects and self.unexplained < STEPWISE.further_share)
         return bool(left and self.last.is_plausible and (self.tried_beside_input_noise or not self.search.logged))
 
     @property
@@ -168,7 +168,7 @@ class Stepwise:
         # nominal errors of each mode, or implausibly large ones, absorb the residual of any linear effect: of effects
         # that leave as little, the one that needs the smallest nominal errors is preferred
         noise, nats_per_parameter = best[0].noise_power, 0.0 if self.search.by_mode else self.search.nats_per_parameter
-        little = best[0].excess(noise) + STEPWISE.no_gap * float(noise.mean())
+        little = best[0].excess(noise) + STEPWISE.noise_excess * float(noise.mean())
         as_good = found if best[0].explains else [s for s in best if s.excess(noise) < little]
         others = [s for s in best if s not in as_good]
         return [
@@ -192,10 +192,10 @@ class Stepwise:
         chosen: list[Fit] = []
         for single in best_of_each_kind(found):
             limiting_cases = contained(single.effects, search.rig)
-            fits_as_well = {f.key for f in found if f.cost < (1.0 + SEARCH.significant) * single.cost}
+            fits_as_well = {f.key for f in found if f.cost < (1.0 + SEARCH.significant_gain) * single.cost}
             if not limiting_cases & fits_as_well:
                 chosen.append(single)
-        chosen = [f for f in chosen[: STEPWISE.singles] if f.cost < STEPWISE.near * chosen[0].cost]
+        chosen = [f for f in chosen[: STEPWISE.singles] if f.cost < STEPWISE.max_cost_ratio * chosen[0].cost]
         # nominal errors may have absorbed an effect, so the best ones without nominal errors are tried too
         alone = [f for f in self.ahead[:1] if not may_be_transducer_errors(search, f.effects)]
         for single in (*linear[:1], *alone):
@@ -251,7 +251,7 @@ class Stepwise:
         excess = best.excess(best.noise_power)
         # beside errors a linear effect at a wrong place, or of a wrong kind, leaves little, but more than noise
         is_linear = is_linear_structural(best.effects[0].kind)
-        if not best.explains and (is_linear or excess > STEPWISE.further * float(self.search.nominal.mean())):
+        if not best.explains and (is_linear or excess > STEPWISE.further_share * float(self.search.nominal.mean())):
             return False
         best = self._simplest(best, self.fitted_singles[1:], self.fitted_singles)
         # quiet noise of the inputs excites weak modes in the prediction alone, which large damping makes up for
@@ -292,7 +292,7 @@ class Stepwise:
         """
         if self.has_plausible_errors or self.last.effects or self.search.logged:
             return False
-        found = few_with_uniform_errors(self.search, self.last, STEPWISE.most)
+        found = few_with_uniform_errors(self.search, self.last, STEPWISE.max_effects)
         if found is None or not self.search.are_noticeable(found.effects, found.effects):
             return False
         if all(effect.stands_out(self.search.rig) for effect in found.effects):
@@ -314,7 +314,9 @@ class Stepwise:
         search, best = self.search, singles[0]
         if not (self.is_noise_only or best.cost < self.last.fit.cost):
             return False
-        if not search.near(best, STEPWISE.almost) or any(effect.kind in UNIFORM for effect in best.effects):
+        if not search.near(best, STEPWISE.single_effect_share) or any(
+            effect.kind in UNIFORM for effect in best.effects
+        ):
             return False
         errors = with_reading_sides(search, nominal_errors(search.rig, search.prior), best.effects)
         found = fit_jointly(search, best.effects, errors, until_convergence=True)
@@ -328,7 +330,7 @@ class Stepwise:
 
     # Further effects
 
-    def run(self, most: int = STEPWISE.most) -> None:
+    def run(self, most: int = STEPWISE.max_effects) -> None:
         """Add effects, `most` in all, as long as each removes most of the residual power above the noise; once."""
         if self.is_complete:
             return
@@ -351,7 +353,7 @@ class Stepwise:
         if self.plain is not None:
             return
         with_uniform = with_uniform_effects(self.search, self.last)
-        self.steps.append(with_delay_as_effect(self.search, with_uniform, STEPWISE.explained * self._gap))
+        self.steps.append(with_delay_as_effect(self.search, with_uniform, STEPWISE.explained_share * self._gap))
         if self.last.effects:
             self.steps.append(
                 fit_jointly(self.search, self.last.effects, self.last.errors, rounds=3, until_convergence=True)
@@ -363,7 +365,7 @@ class Stepwise:
         The likelihood must prefer it too: the noise is seldom exactly as modelled.
         """
         errors_only, noise = self.last, self.last.noise_power
-        length_limit = errors_only.description(noise) - STEPWISE.fewer_words
+        length_limit = errors_only.description(noise) - STEPWISE.saved_nats_beside_plausible
         if length_limit < 0.0:
             return
         sets = [f.effects for f in self._linear_singles[: STEPWISE.finalists]]
@@ -378,10 +380,10 @@ class Stepwise:
 
         def is_found(step: JointFit) -> bool:
             saved = shortest - step.description(noise)
-            likelier = partial(is_likelier, self.search, step, least=SEARCH.trifle)
+            likelier = partial(is_likelier, self.search, step, least=SEARCH.least_gain)
             # errors iterated that far over-fit: an effect that saves much need not be likelier than those
-            return saved > STEPWISE.fewer_words and (
-                likelier(converged) or (saved > STEPWISE.far_fewer_words and likelier(errors_only))
+            return saved > STEPWISE.saved_nats_beside_plausible and (
+                likelier(converged) or (saved > STEPWISE.saved_nats_alone and likelier(errors_only))
             )
 
         found = [s for s in shorter if is_found(s)]
@@ -483,7 +485,7 @@ class Stepwise:
         places = [(effect.moved_to(where),) for where in other_places(effect, domain)]
         here, *others = fitted_to_quick(self.search, [(effect,), *places], step)
         elsewhere = [s for s in others if apart(s.effects[0], here.effects[0], domain)]
-        near = _finalists(sorted(elsewhere, key=lambda s: s.fit.cost), STEPWISE.near * here.fit.cost)
+        near = _finalists(sorted(elsewhere, key=lambda s: s.fit.cost), STEPWISE.max_cost_ratio * here.fit.cost)
         whole = self.search.in_parallel(fitted_to_all, near)
         best = min(whole, key=partial(loss, self.search), default=step)
         return best if loss(self.search, best) < loss(self.search, step) else None
@@ -501,7 +503,7 @@ class Stepwise:
         singles = [f.effects for f in self._linear_singles if f.effects[0].kind not in named][: STEPWISE.finalists]
         tried = self.search.in_parallel(fit_from_zero, [(*step.effects, *each) for each in singles])
         noise = step.noise_power
-        longest = step.description(noise) - STEPWISE.shorter
+        longest = step.description(noise) - STEPWISE.saved_nats
         found = [
             s for s in tried if s.description(noise) < longest and self.search.are_noticeable(s.effects, s.fit.effects)
         ]
@@ -532,16 +534,18 @@ class Stepwise:
         with_errors = search.with_nominal_errors(step.errors)
         cost = cost_of(search.rig, step.fit.effects, with_errors.ahead)
         for loose in SELECTION.continuation[1:]:  # what grows slowly hides in the noise one step ahead
-            if cost > 1.0 + STEPWISE.no_gap or step.explains:
+            if cost > 1.0 + STEPWISE.noise_excess or step.explains:
                 break
             with_errors = replace(with_errors, loose=loose)
             cost = cost_of(search.rig, step.fit.effects, with_errors.ahead)
         rig = apply_all(search.rig, step.fit.effects)
         reconstruction = ForceReconstruction.of(rig, search.data, workers=search.workers, absorbed=True)
         ahead = one_more(with_errors, step.effects, reconstruction)
-        if not ahead or ahead[0].cost > (1.0 - STEPWISE.ahead) * cost:
+        if not ahead or ahead[0].cost > (1.0 - STEPWISE.least_gain_ahead) * cost:
             return []
-        promising, as_good = (cost - share * (cost - ahead[0].cost) for share in (STEPWISE.promising, STEPWISE.as_good))
+        promising, as_good = (
+            cost - share * (cost - ahead[0].cost) for share in (STEPWISE.tried_gain_share, STEPWISE.equal_gain_share)
+        )
         chosen: list[tuple[Effect, ...]] = []
         for candidate in ahead:
             same_kind = sum(candidate.effects[-1].kind is others[-1].kind for others in chosen)
@@ -556,7 +560,7 @@ class Stepwise:
         singles = [] if step.effects else self.fitted_singles
         search = self.search
         tried = sorted((s for s in tried if not may_be_transducer_errors(search, s.effects)), key=partial(loss, search))
-        near = _finalists(tried, STEPWISE.near * tried[0].fit.cost) if tried else []
+        near = _finalists(tried, STEPWISE.max_cost_ratio * tried[0].fit.cost) if tried else []
         whole = search.workers.map(lambda s: without_inactive(search, fitted_to_all(search, s)), near)
         # the most informative records overstate some
         whole = [s for s in whole if not may_be_transducer_errors(search, s.effects)]
@@ -585,12 +589,12 @@ class Stepwise:
             return True
         noise = np.minimum(best.sensor_noise, step.sensor_noise)
         before, after = step.excess(noise), best.excess(noise)
-        is_negligible = bool(step.effects) and before - after < SEARCH.negligible * self._gap
-        share = STEPWISE.further_excess if step.effects and not is_negligible else STEPWISE.excess
+        is_negligible = bool(step.effects) and before - after < SEARCH.negligible_share * self._gap
+        share = STEPWISE.further_removed_share if step.effects and not is_negligible else STEPWISE.first_removed_share
         if not step.explains and before - after > share * before:
             return True
         longer, shorter = (s.description(noise, of_errors_alone=is_negligible) for s in (step, best))
-        return not step.is_plausible and longer - shorter > STEPWISE.shorter
+        return not step.is_plausible and longer - shorter > STEPWISE.saved_nats
 
     def _without_errors(self, step: JointFit) -> Fit | None:
         """Few effects that explain the records without nominal errors as well as a step with them, or None."""
@@ -618,7 +622,7 @@ class Stepwise:
         if found is self.last:
             return False
         # a lag of all channels weakens what is quick, which a gain may stand for
-        late = with_delay_as_effect(self.search, self.last, STEPWISE.explained * self._gap)
+        late = with_delay_as_effect(self.search, self.last, STEPWISE.explained_share * self._gap)
         is_late = late is not self.last and loss(self.search, late) < loss(self.search, found)
         self.steps.append(late if is_late else found)
         return True
@@ -636,19 +640,21 @@ class Stepwise:
             fit_jointly(search, step.effects, step.errors) if self.search.logged else evaluated(search, step.fit)
         )
         noise = without_noise.sensor_noise
-        is_loud = without_noise.excess(noise) > INPUTS.loud * float(noise.mean())
+        is_loud = without_noise.excess(noise) > INPUTS.least_residual * float(noise.mean())
         if without_noise.logged < LEAST_LOGGED or not is_loud:
             return self._continue_in(search, step, without_noise) if self.search.logged else None
         noisy = with_input_noise(search, step.fit, noise)
         if noisy is None:
             return None
         fitted = fit_jointly(noisy, step.effects, step.errors)
-        if fitted.fit.cost < INPUTS.too_white:  # nominal errors had fitted the noise, so it was estimated too loud
+        if (
+            fitted.fit.cost < INPUTS.min_mean_square
+        ):  # nominal errors had fitted the noise, so it was estimated too loud
             noisy = with_input_noise(search, fitted.fit, noise)
             if noisy is None:
                 return None
             fitted = fit_jointly(noisy, step.effects, fitted.errors)
-        if fitted.fit.cost < INPUTS.too_white:
+        if fitted.fit.cost < INPUTS.min_mean_square:
             return None
         # noise this loud masks most effects; if a single effect explains the residual, there is no input noise
         found = None if step.effects or self.search.logged else self._in_place_of_inputs(without_noise)
@@ -662,7 +668,7 @@ class Stepwise:
         tried = [
             s for s in self._candidates_with_one_more(step) if not may_be_transducer_errors(self.search, s.effects)
         ]
-        near = _finalists(sorted(tried, key=lambda s: s.fit.cost), PLAIN.near)
+        near = _finalists(sorted(tried, key=lambda s: s.fit.cost), PLAIN.max_residual)
         whole = self.search.in_parallel(fitted_to_all, near)
         found = [s for s in whole if s.explains and s.is_plausible and self._is_accepted(s, step)]
         if not found:
@@ -682,15 +688,15 @@ class Stepwise:
         The selection continues with these substeps: the error of coarser ones would pass for another effect.
         """
         rig, noise = apply_all(self.search.rig, step.fit.effects), step.noise_power
-        is_near_noise = step.excess(noise) < STEPWISE.further * self._gap
+        is_near_noise = step.excess(noise) < STEPWISE.further_share * self._gap
         if not (step.effects and is_near_noise and is_stepped(rig)) or step.explains:
             return step
         data, substeps = self.search.data, self.search.data.substeps
         residual = data.residual(rig)
-        while substeps < FINISH.finest:
+        while substeps < FINISH.substeps:
             finer = data.stepped(2 * substeps).residual(rig)
             change, residual = finer - residual, finer
-            if float(change @ change) < STEPWISE.stepping * change.size:
+            if float(change @ change) < STEPWISE.integration_error * change.size:
                 break
             substeps *= 2
         if substeps == data.substeps:
@@ -713,7 +719,7 @@ class Stepwise:
             )
         effects, left = self.last.effects, self.unexplained
         noise = np.sqrt(self.last.sensor_noise) * self.search.data.noise
-        closed = self.closes_gap or (len(effects) > 1 and left < STEPWISE.in_part)
+        closed = self.closes_gap or (len(effects) > 1 and left < STEPWISE.several_effects_share)
         if effects and closed and not self.shows_unknown_law:
             return Decision("explained", self.last.fit, alternatives=self._alternatives(), noise=noise, beside=beside)
         if self.needs_no_effect:
@@ -743,7 +749,7 @@ class Stepwise:
         ]
         odds = np.exp(min(length) - np.array(length))
         likely = sorted(zip(sets[1:], odds[1:] / odds.sum(), strict=True), key=lambda each: -each[1])
-        return tuple((s.fit, float(p)) for s, p in likely if p > STEPWISE.excluded)
+        return tuple((s.fit, float(p)) for s, p in likely if p > STEPWISE.min_probability)
 
     def _others(self) -> list[JointFit]:
         """The last set as it was selected, then the other candidates that explain the records or fit as well."""

@@ -42,7 +42,7 @@ class WithRandom(NamedTuple):
 
     def is_near(self, search: Search) -> bool:
         """Whether the whitened residual is small, and the force no tone, so that a further effect may be missing."""
-        return search.near(self.fit, RANDOM.near) and not self.random.tonal > TONAL
+        return search.near(self.fit, RANDOM.max_residual_share) and not self.random.tonal > TONAL
 
 
 def looks_random(reconstruction: ForceReconstruction) -> bool:
@@ -55,16 +55,16 @@ def looks_random(reconstruction: ForceReconstruction) -> bool:
     records, place = reconstruction.data.counted, reconstruction.at_peaks[0]
     forces = np.split(place.force, np.cumsum([record.n_samples for record in records])[:-1])
     elastic = reconstruction.rig.modes.omega[reconstruction.rig.modes.omega > 0] / (2.0 * np.pi)
-    slowest = RANDOM.drifting * float(elastic[0]) if elastic.size else 0.0
+    slowest = RANDOM.least_frequency * float(elastic[0]) if elastic.size else 0.0
     levels = np.array([_rms_above(slowest, force, records[0].sample_time) for force in forces])
-    if len(forces) < 2 or np.ptp(levels) > RANDOM.spread * levels.mean():
+    if len(forces) < 2 or np.ptp(levels) > RANDOM.max_rms_spread * levels.mean():
         return False
     if min(tonal(force, records[0].sample_time) for force in forces) > TONAL:
         return False
     shape = reconstruction.rig.modes.phi_at(place.at)
     motions = [shape @ np.array([motion.displacement, motion.velocity]) for motion in reconstruction.motions]
     each = zip(forces, records, motions, strict=True)
-    return max(followed(force, record.inputs, motion) for force, record, motion in each) < RANDOM.follows
+    return max(followed(force, record.inputs, motion) for force, record, motion in each) < RANDOM.max_predicted_share
 
 
 def _rms_above(frequency: float, force: Floats, sample_time: float) -> float:
@@ -88,7 +88,7 @@ def decide_on_random(search: Search, reconstruction: ForceReconstruction) -> tup
     if not alone.is_near(search):
         return None, []
     tried = [alone]
-    for _ in range(RANDOM.beside):
+    for _ in range(RANDOM.max_effects_beside):
         with_one_more = _with_one_more(search, tried[-1], reconstruction)
         if with_one_more is None:
             return None, []
@@ -106,7 +106,7 @@ def random_with_effects(search: Search, found: Sequence[Fit]) -> Decision | None
     If none holds but one is near, a further effect is tried with it.
     """
     tried, searches = [], []
-    for given in best_of_each_kind(found)[: RANDOM.likeliest_sets]:
+    for given in best_of_each_kind(found)[: RANDOM.other_sets]:
         unclipped, reconstruction = _without_clipped(search, given.effects, search.reconstruction_with(given.effects))
         reconstruction = _with_laws_on_measured_motion(unclipped, reconstruction)
         if looks_random(reconstruction):
@@ -133,7 +133,9 @@ def _with_one_more(search: Search, best: WithRandom, reconstruction: ForceRecons
     search.progress("effects with a random disturbance", 0.2)
     whitener = model_filter(reconstruction.model, reconstruction.rig, best.random)
     whitened = search.through(whitener, _observer(search, reconstruction.rig, best.random))
-    gaining = whitened.in_parallel(simplest, _improving(search, whitened, best.given, reconstruction)[: RANDOM.tried])
+    gaining = whitened.in_parallel(
+        simplest, _improving(search, whitened, best.given, reconstruction)[: RANDOM.joint_fits]
+    )
     if any(search.explains(finished(search, candidate)) for candidate in gaining):
         return None
     found = [_fitted_with_random(search, candidate) for candidate in gaining]
@@ -154,18 +156,18 @@ def random_with_nominal_errors(search: Search, step: JointFit, *, surely: bool =
     if surely and not looks_random(reconstruction):
         return None
     found, random = _random_given(search, step.fit, reconstruction)
-    for _ in range(RANDOM.turns):
+    for _ in range(RANDOM.max_alternations):
         before = random.cost
         whitener = model_filter(reconstruction.model, reconstruction.rig, random)
         whitened = search.through(whitener, _observer(search, search.rig, random))
         step = fit_jointly(whitened, step.effects, step.errors)
         reconstruction = _reconstruction_with(search, step.fit.effects)
         found, random = _random_given(search, step.fit, reconstruction)
-        if random.cost > (1.0 - RANDOM.settled) * before:
+        if random.cost > (1.0 - RANDOM.tolerance) * before:
             break
     cost = cost_of(search.rig, step.fit.effects, search.data)
-    is_closed = random.left - 1.0 < STEPWISE.explained * cost
-    is_noticeable = cost - 1.0 > SEARCH.negligible * float(search.nominal.mean())
+    is_closed = random.left - 1.0 < STEPWISE.explained_share * cost
+    is_noticeable = cost - 1.0 > SEARCH.negligible_share * float(search.nominal.mean())
     holds = is_closed and is_noticeable and random.is_steady and looks_random(reconstruction)
     return Decision("explained", found, random) if holds else None
 
@@ -197,11 +199,13 @@ def _improving(
     places = [f.effects[-1].at for f in found if f.effects[-1].at is not None]
     if places:
         found = sorted((*found, *fitted(reconstruction.of_force_at(places[0]))), key=lambda f: f.cost)
-    alternatives = [f for f in best_of_each_kind(found) if f.cost < found[0].cost + RANDOM.alternative]
+    alternatives = [f for f in best_of_each_kind(found) if f.cost < found[0].cost + RANDOM.alternative_margin]
     # small errors of gains and places remove a little of what the given effects leave
     before = cost_of(search.rig, given, search.data)
     return [
-        f for f in alternatives if before - cost_of(search.rig, f.effects, search.data) > SEARCH.negligible * before
+        f
+        for f in alternatives
+        if before - cost_of(search.rig, f.effects, search.data) > SEARCH.negligible_share * before
     ]
 
 
@@ -228,7 +232,7 @@ def _best_decision(search: Search, tried: Sequence[WithRandom]) -> Decision | No
         return len(found.effects) == len(fewest.effects) or search.surely_better(found, fewest.cost, extra)
 
     justified = [found for found, _ in holding if is_justified(found)]
-    plain = plainest(search, justified, worth=SEARCH.significant)
+    plain = plainest(search, justified, worth=SEARCH.significant_gain)
     best, alternatives = ranked(search, plain)
     return Decision("explained", best, next(random for found, random in holding if found is best), alternatives)
 
@@ -242,8 +246,8 @@ def _fitted_with_random(search: Search, given: Fit, reconstruction: ForceReconst
     if reconstruction is None:
         reconstruction = _reconstruction_with(search, given.effects)
     found = _random_given(search, given, reconstruction)
-    for _ in range(RANDOM.turns if given.effects else 0):
-        if found.random.holds or not search.near(found.fit, RANDOM.near):
+    for _ in range(RANDOM.max_alternations if given.effects else 0):
+        if found.random.holds or not search.near(found.fit, RANDOM.max_residual_share):
             break
         before = found.random.cost
         observer = _observer(search, reconstruction.rig, found.random)
@@ -253,7 +257,7 @@ def _fitted_with_random(search: Search, given: Fit, reconstruction: ForceReconst
         given = replace(refitted, cost_by_channel=search.data.by_channel(search.data.residual(reconstruction.rig)))
         reconstruction = _with_laws_on_measured_motion(search, reconstruction, observer)
         found = _random_given(search, given, reconstruction)
-        if found.random.cost > (1.0 - RANDOM.settled) * before:
+        if found.random.cost > (1.0 - RANDOM.tolerance) * before:
             break
     return found
 
@@ -283,7 +287,7 @@ def _with_laws_on_measured_motion(
 def _random_given(search: Search, given: Fit, reconstruction: ForceReconstruction) -> WithRandom:
     """The given effects with a random force fitted to their residual, and the statistics of that force."""
     domain = reconstruction.domain
-    most = RANDOM.points if isinstance(domain, NamedPoints) else RANDOM.starts
+    most = RANDOM.start_points if isinstance(domain, NamedPoints) else RANDOM.start_places
     places = [where for where in reconstruction.peaks if not isinstance(where, Between)][:most]
     found = fit_random_force(
         reconstruction.rig, search.data, reconstruction.residuals, places, reconstruction.data.force_rms
@@ -291,12 +295,14 @@ def _random_given(search: Search, given: Fit, reconstruction: ForceReconstructio
     rms, rms_std = found.acting_rms
     # standard errors are no smaller than a residual that is not white allows, nor than two good models differ by
     level = np.sqrt(max(float(found.chi2_by_record.mean()), 1.0))
-    least = INTERVALS.alike * domain.size if found.at_std else 0.0
+    least = INTERVALS.model_difference * domain.size if found.at_std else 0.0
     at_std = (max(float(level * std), least) for std in found.at_std)
     spread = dict(zip(domain.coordinates, at_std, strict=True))
     # the force is inferred from its response, so it is as uncertain as mass and stiffness
     priors = (e.target for e in given.effects if isinstance(e.target, NominalPrior))
-    model_uncertainty = max((float(np.hypot(prior.mass, prior.stiffness)) for prior in priors), default=INTERVALS.alike)
+    model_uncertainty = max(
+        (float(np.hypot(prior.mass, prior.stiffness)) for prior in priors), default=INTERVALS.model_difference
+    )
     deviations = {**spread, "rms": float(np.hypot(level * rms_std, model_uncertainty * rms))}
     effect = Effect(RANDOM_DISTURBANCE, None, {**place_values(found.at), "rms": rms}, deviations)
     fitted = given.n_parameters + 1 + len(spread)
