@@ -35,7 +35,7 @@ from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.jointly import fit_jointly, with_all_errors
 from workbench.gap.search.screening import on_whole_records, one_more
 from workbench.gap.search.search import Alternatives, Search, best_of_each, best_of_each_kind, most_informative
-from workbench.gap.search.settings import ATTRIBUTION, PAIRS, SELECTION
+from workbench.gap.search.settings import ATTRIBUTION, FIT, SEARCH, SELECTION
 from workbench.gap.search.stages import Stages
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
@@ -237,7 +237,7 @@ def attribute(
     search = stages.search
     is_cut = search.is_over
     final_search = own_search or search
-    if seen and outcome == "unknown" and start.cost - 1.0 < ATTRIBUTION.noise_share * (of_nominal.mean() - 1.0):
+    if seen and outcome == "unknown" and start.cost - 1.0 < SEARCH.explained_share * (of_nominal.mean() - 1.0):
         outcome, best, alternatives, noise = "explained", start, (), None  # nothing explains the little that is left
     best = uniform_as_nominal_errors(search, best, alone=random is not None)
     if outcome == "explained" and random is None:
@@ -304,7 +304,7 @@ def _with_one_for_two(search: Search, best: Fit) -> Fit:
     for two in combinations(linear, 2):
         rest = tuple(effect for effect in best.effects if effect not in two)
         ahead = one_more(narrow, rest, search.reconstruction_with(rest))
-        for fewer in on_whole_records(narrow, ahead, PAIRS.finalists_beside):
+        for fewer in on_whole_records(narrow, ahead, SEARCH.few_finalists):
             extra = max(best.n_parameters - fewer.n_parameters, 0)
             if search.explains(fewer) and not search.distinguishes(here, fewer.cost, extra):
                 return fewer
@@ -327,9 +327,7 @@ def _merged(search: Search, best: Fit, alternatives: Alternatives) -> tuple[Fit,
 def _refitted(search: Search, effects: Sequence[Effect], data: FitData) -> Fit:
     """The effects refitted to all records from good start values, whether or not the deadline is past."""
     finely = replace(data.finely(SELECTION.substeps), deadline=NEVER)
-    return fit(
-        search.rig, effects, finely, iterations=ATTRIBUTION.joint_iterations, workers=search.workers, chord=Chord()
-    )
+    return fit(search.rig, effects, finely, iterations=FIT.iterations, workers=search.workers, chord=Chord())
 
 
 def _significant(search: Search, best: Fit, seen: Sequence[Effect], logged: float) -> Fit:
@@ -407,9 +405,7 @@ def with_identified_errors(search: Search, best: Fit, identified: IdentifiedPrio
         return best
 
     def fitted_with(effects: Sequence[Effect], errors: Effect) -> Fit:
-        return fit(
-            search.rig, (*effects, errors), search.data, iterations=ATTRIBUTION.joint_iterations, workers=search.workers
-        )
+        return fit(search.rig, (*effects, errors), search.data, iterations=FIT.iterations, workers=search.workers)
 
     found = fitted_with(others, nominal_errors(search.rig, identified))
     while len(found.effects) > 2:

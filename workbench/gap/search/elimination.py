@@ -63,7 +63,7 @@ def _refitted_to_all(search: Search, on_quick: Sequence[JointFit], best: JointFi
     """The steps; those that may be as good as `best`, which was fitted to all records, are refitted to all."""
     if not best.explains:
         return on_quick
-    cost_limit = max(STEPWISE.max_cost_ratio * best.fit.cost, SEARCH.negligible_share * gap)
+    cost_limit = max(SEARCH.max_cost_ratio * best.fit.cost, SEARCH.negligible_share * gap)
     return search.workers.map(
         lambda s: fit_jointly(search, s.effects, s.errors, rounds=2) if s.fit.cost < cost_limit else s, on_quick
     )
@@ -77,7 +77,7 @@ def _simpler_singles(search: Search, best: JointFit, ahead: Sequence[Fit]) -> li
     good = nominal - STEPWISE.equal_gain_share * (nominal - ahead[0].cost)
     likely = [f.effects for f in best_of_each_kind(ahead) if f.cost <= good and f.n_parameters < size]
     on_quick = fitted_to_quick(search, likely, best)
-    near = [step for step in on_quick if step.fit.cost < STEPWISE.max_cost_ratio * best.fit.cost]
+    near = [step for step in on_quick if step.fit.cost < SEARCH.max_cost_ratio * best.fit.cost]
     fitted = [fitted_to_all(search, step) for step in near]
     return [step for step in fitted if not may_be_transducer_errors(search, step.effects)]
 

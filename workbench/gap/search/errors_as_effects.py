@@ -31,7 +31,7 @@ from workbench.gap.search.jointly import (
     with_all_groups,
 )
 from workbench.gap.search.search import Search
-from workbench.gap.search.settings import ERRORS, JOINT, STEPWISE
+from workbench.gap.search.settings import ERRORS, JOINT, SEARCH
 from workbench.rig.rig import Rig
 from workbench.structure.domain import middle
 from workbench.structure.member import Structure
@@ -237,7 +237,7 @@ def with_wrong_transducers(search: Search, step: JointFit) -> JointFit:
         is_wrong = _size(search.rig, found.effects[-1]) >= max(
             limit, ERRORS.outlier_ratio * size_of(found.errors, group)
         )
-        is_as_near = found.explains or found.fit.cost < STEPWISE.max_cost_ratio * step.fit.cost
+        is_as_near = found.explains or found.fit.cost < SEARCH.max_cost_ratio * step.fit.cost
         if not (is_wrong and is_as_near and search.are_noticeable(found.effects, found.fit.effects)):
             break
         step = found

@@ -20,7 +20,7 @@ from workbench.gap.effects.effect import (
 from workbench.gap.localisation.force_reconstruction import ForceReconstruction
 from workbench.gap.search.fit import Chord, Fit, cost_of, finite_residual, fit
 from workbench.gap.search.search import Alternatives, Search, best_of_each, promise
-from workbench.gap.search.settings import FINISH, SEARCH, SELECTION
+from workbench.gap.search.settings import FINISH, FIT, SEARCH, SELECTION
 from workbench.rig.simulate import is_stepped
 from workbench.structure.domain import Between, Domain, Interval, Location, Rectangle
 
@@ -76,9 +76,7 @@ def widened(search: Search, found: Fit) -> Fit:
     cost = cost_of(search.rig, found.effects, data)
 
     def refitted(effects: Sequence[Effect]) -> Fit:
-        return fit(
-            search.rig, effects, data, iterations=FINISH.generalising_iterations, workers=search.workers, chord=Chord()
-        )
+        return fit(search.rig, effects, data, iterations=FIT.iterations, workers=search.workers, chord=Chord())
 
     for effects in sets:
         trial = refitted(effects)

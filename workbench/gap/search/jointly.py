@@ -430,11 +430,11 @@ def with_input_noise(search: Search, fitted: Fit, sensor_noise: np.ndarray) -> S
         return None
     noisy = best.with_input_noise(rig, share)
     white = evaluated(noisy, fitted).fit
-    if INPUTS.max_mean_square < white.cost < INPUTS.over_fitted_share * fitted.cost:
+    if SEARCH.near_noise < white.cost < INPUTS.over_fitted_share * fitted.cost:
         fitted = white = fit_jointly(noisy, fitted.effects[:-1], fitted.effects[-1]).fit
         rig = apply_all(search.rig, fitted.effects)
         residuals = search.data.differences(rig)
-    if white.cost > INPUTS.max_mean_square:
+    if white.cost > SEARCH.near_noise:
         return None
     for _ in range(INPUTS.noise_updates):  # sensor noise from the power of the innovations
         best = best.with_noise(best.data.noise * np.sqrt(white.cost_by_channel.mean(axis=0)))
@@ -508,7 +508,7 @@ def _interpolated(search: Search, ahead: Fit) -> Fit:
     delays = in_group(errors.values, "delay")
     is_late = any(effect.kind in TIMING for effect in effects)
     may_be_late = is_late or max(map(abs, delays.values()), default=0.0) > JOINT.certain_delay
-    if not may_be_late and (effects or ahead.cost < JOINT.interpolation_residual):
+    if not may_be_late and (effects or ahead.cost < SEARCH.near_noise):
         return ahead
     prior = replace(search.prior, interpolated=True)
     interpolated = _fitted_ahead(search, effects, nominal_errors(search.rig, prior, delays))

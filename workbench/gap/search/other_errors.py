@@ -12,7 +12,7 @@ from workbench.gap.search.errors_as_effects import TRANSDUCER_GROUPS
 from workbench.gap.search.fit import finite_residual
 from workbench.gap.search.jointly import JointFit, fit_from_zero, too_large
 from workbench.gap.search.search import Search
-from workbench.gap.search.settings import INTERVALS, RECORDS, STEPWISE
+from workbench.gap.search.settings import ERRORS, INTERVALS, RECORDS, SEARCH, STEPWISE
 from workbench.gap.search.stepwise import Stepwise
 
 
@@ -37,9 +37,7 @@ class Deviations:
     def is_sure(self) -> bool:
         """Whether the two records that are farthest apart differ by more than chance."""
         i, j = int(self.values.argmin()), int(self.values.argmax())
-        return bool(
-            self.values[j] - self.values[i] > RECORDS.standard_errors * np.hypot(self.spread[i], self.spread[j])
-        )
+        return bool(self.values[j] - self.values[i] > ERRORS.standard_errors * np.hypot(self.spread[i], self.spread[j]))
 
 
 def deviations(search: Search, effects: Sequence[Effect], parameter: str) -> Deviations | None:
@@ -134,7 +132,7 @@ def with_record_deviations(before: Stepwise) -> Stepwise | None:
     if (
         with_deviations.is_sufficient
         or with_deviations.by_singles()
-        or with_deviations.nearest.excess(noise) < RECORDS.max_residual * nearest.excess(noise)
+        or with_deviations.nearest.excess(noise) < SEARCH.halved * nearest.excess(noise)
     ):
         with_deviations.run()
         return with_deviations
@@ -170,10 +168,7 @@ def with_mode_errors(before: Stepwise) -> Stepwise | None:
     else:
         refitted = fit_from_zero(with_modes.search, nearest.effects)
         excess = nearest.excess(nearest.noise_power)
-        if (
-            before.has_plausible_errors
-            and refitted.excess(refitted.noise_power) > STEPWISE.mode_error_residual * excess
-        ):
+        if before.has_plausible_errors and refitted.excess(refitted.noise_power) > SEARCH.halved * excess:
             return None
         with_modes.known = [refitted] if len(refitted.effects) == 1 else []
     if not with_modes.by_singles():

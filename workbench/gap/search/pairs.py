@@ -84,12 +84,12 @@ class Pairs:
         if self.explain or not self.ahead or search.is_over:
             return False
         pair = self.ahead[0]
-        most = min(PAIRS.max_residual_share * (search.nominal_ahead - 1.0), PAIRS.improvement_ratio * (single - 1.0))
+        most = min(PAIRS.max_residual_share * (search.nominal_ahead - 1.0), SEARCH.halved * (single - 1.0))
         if pair.cost - 1.0 > most:
             return False
         search.progress("three effects at once", 0.45)
         three = one_more(search, pair.effects, search.reconstruction_with(pair.effects))
-        if not three or three[0].cost - 1.0 > PAIRS.improvement_ratio * (pair.cost - 1.0):
+        if not three or three[0].cost - 1.0 > SEARCH.halved * (pair.cost - 1.0):
             return False
         for two in list(each_left_out(three[0].effects)):
             three = [*three, *one_more(search, two, search.reconstruction_with(two))]
@@ -112,7 +112,7 @@ class Pairs:
             best = self.ahead[0]
             if self.with_any(_by_contribution(self.search, best)):
                 return True
-            if self.ahead[0].cost > PAIRS.improvement_ratio * best.cost:
+            if self.ahead[0].cost > SEARCH.halved * best.cost:
                 break
         return self._from_other_places()
 
@@ -146,10 +146,10 @@ class Pairs:
         enough = max(SELECTION.max_residual_ahead, SELECTION.max_share_ahead * self.search.nominal_ahead)
         promising = [f for f in ahead if f.cost < enough]
         fresh = [f for f in promising if not any(in_one_minimum(f, other, domain) for other in self.continued)]
-        most = PAIRS.finalists_beside if self.found else PAIRS.finalists
+        most = SEARCH.few_finalists if self.found else SEARCH.finalists
         self.continued = [*self.continued, *fresh[:most]]
         self._add(on_whole_records(self.search, fresh, most))
-        near = [pair for pair in self.found[: PAIRS.relocated_pairs] if not _was_finished(pair, self.ended)]
+        near = [pair for pair in self.found[: SEARCH.few_finalists] if not _was_finished(pair, self.ended)]
         taken = _finished(self.search, near)
         self.ended = [*self.ended, *near, *taken]
         self._add(taken)
@@ -160,7 +160,7 @@ class Pairs:
         search = self.search
         if search.is_over:
             return False
-        likeliest = best_of_each(self.found)[: PAIRS.relocated_pairs]
+        likeliest = best_of_each(self.found)[: SEARCH.few_finalists]
         fresh = [
             f for f in likeliest if search.near(f, PAIRS.near_share) and not _was_finished(f, self.relocated_pairs)
         ]
@@ -172,7 +172,7 @@ class Pairs:
         if not self.found or not search.near(self.found[0], RANDOM.max_residual_share):
             return False
         best = self.found[0]
-        if not all(best.cost - 1.0 < PAIRS.improvement_ratio * (miss.cost - 1.0) for miss in self.near_misses):
+        if not all(best.cost - 1.0 < SEARCH.halved * (miss.cost - 1.0) for miss in self.near_misses):
             return False
         self.near_misses = [*self.near_misses, best]
         return self.with_any(best.effects[::-1])

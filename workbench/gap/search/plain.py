@@ -26,7 +26,7 @@ from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.jointly import JointFit, surely_late, with_reading_sides
 from workbench.gap.search.screening import Screening, on_whole_records, one_more
 from workbench.gap.search.search import Alternatives, Search, first_of_each, promise
-from workbench.gap.search.settings import ERRORS, PAIRS, PLAIN, SEARCH, SELECTION, STEPWISE
+from workbench.gap.search.settings import ERRORS, FIT, PLAIN, SEARCH, SELECTION, STEPWISE
 from workbench.rig.rig import Rig
 
 
@@ -121,21 +121,21 @@ def _simplest_explaining(search: Search, sets: Sequence[tuple[Effect, ...]], ste
 
     def briefly(effects: Sequence[Effect]) -> Fit:
         found = fit(search.rig, effects, search.quick, iterations=PLAIN.first_iterations)
-        extra = PLAIN.iterations - PLAIN.first_iterations
-        if not found.falling or promise(found, extra) > PLAIN.max_residual:
+        extra = FIT.iterations - PLAIN.first_iterations
+        if not found.falling or promise(found, extra) > SEARCH.near_noise:
             return found
         return fit(search.rig, found.effects, search.quick, iterations=extra)
 
     on_quick = search.workers.map(briefly, list(sets))
     promising = [
-        f for f in on_quick if f.cost < PLAIN.max_residual and not _is_surely_worse(search, f, step, search.quick)
+        f for f in on_quick if f.cost < SEARCH.near_noise and not _is_surely_worse(search, f, step, search.quick)
     ]
     fine_data, best = search.data.finely(SELECTION.substeps), None
     for candidate in sorted(promising, key=lambda f: f.n_parameters):
         if best is not None and set(best.labels) <= set(candidate.labels):
             continue
         effects = _with_reading_sides(search, candidate.effects)
-        found = fit(search.rig, effects, fine_data, iterations=PLAIN.iterations)
+        found = fit(search.rig, effects, fine_data, iterations=FIT.iterations)
         extra = 0 if best is None else found.n_parameters - best.n_parameters
         explains = search.explains(found) and not _is_surely_worse(search, found, step, fine_data)
         if explains and (best is None or search.surely_better(found, best.cost, extra)):
@@ -201,11 +201,11 @@ def few_with_uniform_errors(search: Search, step: JointFit, most: int) -> Fit | 
         if search.is_over:
             return None
         ahead = one_more(search, best.effects, search.reconstruction_with(best.effects))
-        fits = on_whole_records(search, ahead, PAIRS.finalists_beside)
+        fits = on_whole_records(search, ahead, SEARCH.few_finalists)
         if not fits:
             return None
-        is_better = fits[0].cost - 1.0 < PAIRS.improvement_ratio * (best.cost - 1.0)
-        if not (is_better or ahead[0].cost < PAIRS.improvement_ratio * cost_of(search.rig, best.effects, search.ahead)):
+        is_better = fits[0].cost - 1.0 < SEARCH.halved * (best.cost - 1.0)
+        if not (is_better or ahead[0].cost < SEARCH.halved * cost_of(search.rig, best.effects, search.ahead)):
             return None
         limiting_cases, cost_limit = (
             contained(fits[0].effects, search.rig),
@@ -215,7 +215,7 @@ def few_with_uniform_errors(search: Search, step: JointFit, most: int) -> Fit | 
         named = [effect for effect in best.effects if effect.kind not in UNIFORM]
         if any(is_plausible_error(effect, search) for effect in named):
             return None
-        if best.cost < PLAIN.max_residual and search.explains(finished(search, best)):
+        if best.cost < SEARCH.near_noise and search.explains(finished(search, best)):
             fewer = (named, *each_left_out(named), *simpler_sets(named, search.rig))
             sets = [(*s, *some) for s in fewer for some in _subsets(NO_UNIFORM_ERROR)]
             found = _simplest_explaining(search, [s for s in sets if s], step)
@@ -236,7 +236,7 @@ def _with_one_linear_effect(
     linear_kinds = tuple(kind for kind in search.catalogue if is_linear_structural(kind))
     if not linear_kinds:
         return None
-    start = fit(search.rig, effects, search.quick, iterations=PLAIN.iterations)
+    start = fit(search.rig, effects, search.quick, iterations=FIT.iterations)
     # the residual is too small for another effect; with input noise it is weighted down, so its size does not decide
     if not search.logged and start.cost < 1.0 + STEPWISE.noise_excess:
         return None
@@ -244,7 +244,7 @@ def _with_one_linear_effect(
     screened = Screening.of(
         replace(search, catalogue=linear_kinds), given, search.reconstruction_with(given)
     ).likeliest()
-    likeliest = first_of_each(screened, lambda effect: effect.kind)[: PLAIN.additional_kinds]
+    likeliest = first_of_each(screened, lambda effect: effect.kind)[: SEARCH.finalists]
     beside = tuple(dict.fromkeys(((), common)))
     sets = [(*given, effect, *some) for effect in likeliest for some in beside]
     found = _simplest_explaining(search, sets, step)
@@ -254,7 +254,7 @@ def _with_one_linear_effect(
     if found is None:
         return None
     others = [e for e in found.effects if e.kind in UNIFORM or any(e.label == other.label for other in given)]
-    without = fit(search.rig, others, search.data.finely(SELECTION.substeps), iterations=PLAIN.iterations)
+    without = fit(search.rig, others, search.data.finely(SELECTION.substeps), iterations=FIT.iterations)
     extra = found.n_parameters - without.n_parameters
     is_justified = without.cost - found.cost > SEARCH.significant_gain and search.surely_better(
         found, without.cost, extra
@@ -264,9 +264,9 @@ def _with_one_linear_effect(
 
 def _elsewhere(search: Search, sets: Sequence[tuple[Effect, ...]], start: Fit) -> list[Effect]:
     """The last effect of the best set at other places; none unless it leaves little of what the start does."""
-    fits = search.workers.map(lambda s: fit(search.rig, s, search.quick, iterations=PLAIN.iterations), sets)
+    fits = search.workers.map(lambda s: fit(search.rig, s, search.quick, iterations=FIT.iterations), sets)
     best = min(fits, key=lambda f: f.cost, default=start)
-    if best is start or best.cost - 1.0 > PAIRS.improvement_ratio * (start.cost - 1.0):
+    if best is start or best.cost - 1.0 > SEARCH.halved * (start.cost - 1.0):
         return []
     effect = best.effects[-1]
     if effect.at is None:

@@ -234,9 +234,7 @@ def _at_likely_places(found: Sequence[Fit], screened: Screening) -> list[Effect]
     ]
     if isinstance(screened.domain, NamedPoints):
         return of_transducer
-    likeliest = [f.effects[-1] for f in best_of_each_kind(found) if is_linear(f.effects[-1])][
-        : SELECTION.exchanged_effects
-    ]
+    likeliest = [f.effects[-1] for f in best_of_each_kind(found) if is_linear(f.effects[-1])][: SEARCH.few_finalists]
     linear = {effect.kind: effect for effect in reversed(starts) if is_linear(effect)}
     there = [e.moved_to(one.at) for one in likeliest for e in linear.values() if e.kind is not one.kind]
     return [*there, *of_transducer]
@@ -290,7 +288,7 @@ def on_whole_records(
         at_first: iterations before that is predicted; None for `SELECTION.first_iterations`.
     """
     at_first = SELECTION.first_iterations if at_first is None else at_first
-    close = [f for f in ahead[:most] if f.cost < SELECTION.max_ratio_ahead * ahead[0].cost]
+    close = [f for f in ahead[:most] if f.cost < SEARCH.max_cost_ratio * ahead[0].cost]
     simpler = contained(close[0].effects, search.rig) if close else set()
     first = [f for f in close if f is close[0] or f.key in simpler]
     fits = search.workers.map(lambda f: by_continuation(search, f.effects, at_first), first)
@@ -302,7 +300,7 @@ def on_whole_records(
     fits = sorted((*fits, *more), key=promise)
     fits = _without_generalisations(search, fits, fits)
     to_cost = min([to_cost, *(f.cost + SEARCH.alternative_margin for f in fits if search.explains(f))])
-    running = [f for f in fits if f.falling and promise(f) < SELECTION.max_predicted_ratio * promise(fits[0])]
+    running = [f for f in fits if f.falling and promise(f) < SEARCH.max_cost_ratio * promise(fits[0])]
     running = [f for f in running if promise(f, SEARCH.extrapolated_iterations) < to_cost]
     longer = search.workers.map(lambda f: whole(search, f.effects, 25), running)
     return sorted((*longer, *(f for f in fits if f not in running)), key=lambda f: f.cost)

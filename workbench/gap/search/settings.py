@@ -26,6 +26,16 @@ class SearchSettings:
     alternative_margin: float = 0.02
     # iterations like the last: a fit that would still be too high after them is given up
     extrapolated_iterations: int = 100
+    # of the gap's power above the noise: largest residual of an explanation, be it one effect alone, although nominal
+    # errors would have to be implausibly large, or several beside them. Of 21 trials without an effect, the best single
+    # one left over 0.06; of 38 others, one left 0.013 and was named at 0.02. A mass on a frame leaves 0.007
+    explained_share: float = 0.01
+    halved: float = 0.5  # of the residual above the noise: a set that leaves less is nearer by far
+    near_noise: float = 2.0  # times the noise power: a larger residual is not near it
+    # times the least cost, or the least that is predicted for whole records: sets above it are followed no further
+    max_cost_ratio: float = 2.0
+    finalists: int = 4  # sets or effects that are fitted on, where all are searched
+    few_finalists: int = 2  # likewise, where some effects are given or a fit takes long
     coarse_step: float = 2.0  # times the noise: quantisation in smaller steps adds nearly white noise
 
 
@@ -33,6 +43,7 @@ class SearchSettings:
 class FitSettings:
     """Constants of the nonlinear least-squares fit."""
 
+    iterations: int = 8  # of a fit that decides between sets
     damping: float = 1e-3  # of the diagonal of the normal equations, at the first step; less lets fits diverge
     curvature_step: float = 0.1  # of a step: distance over which its curvature is measured
     # bound of geodesic acceleration: twice the correction over the length of the step (Transtrum & Sethna, 2012)
@@ -70,7 +81,6 @@ class SelectionSettings:
     fits_to_one_record: int = 16  # sets fitted to one-step-ahead predictions of one record
     fits_to_two_records: int = 10  # of these, sets fitted to two records
     fits_until_convergence: int = 5  # of these, sets fitted until convergence
-    exchanged_effects: int = 2  # best linear effects at whose places the other linear kinds are tried
     max_cost_ratio: float = 10.0  # times the best predicted cost: fits above it are not continued
     # times the noise power one step ahead, or this share of the nominal residual there (with coarse time steps, small
     # noise is below the integration error): a set with a larger residual does not explain the records
@@ -79,9 +89,7 @@ class SelectionSettings:
     # process noise of the observers of a continuation, one after the other: the smaller, the lower the observer gain
     continuation: tuple[float, ...] = (LOOSE, 0.1 * LOOSE, 0.01 * LOOSE)
     convergence_residual: float = 10.0  # times the noise power on whole records: from there, a fit to them converges
-    max_ratio_ahead: float = 2.0  # times the least one-step-ahead cost: sets above it are not fitted to whole records
     first_iterations: int = 5  # iterations on whole records before the best fits are chosen
-    max_predicted_ratio: float = 2.0  # times the best predicted cost on whole records: fits above it are not continued
 
 
 @dataclass(frozen=True)
@@ -98,7 +106,6 @@ class FinishSettings:
     max_cost_ratio: float = 30.0  # times the cost of the set: a simpler form that costs more after them is dropped
     place_iterations: int = 2  # iterations at each other place before the best places are chosen
     max_place_cost: float = 0.98  # of the cost on these records: another place with a higher cost is no better minimum
-    generalising_iterations: int = 8  # iterations of a set with an effect replaced by a more general one
     # times its strength: start values of an effect at another place
     strength_factors: tuple[float, ...] = (1.0, 0.01, 0.1, 10.0, 100.0)
 
@@ -112,12 +119,9 @@ class RandomSettings:
     alternative_margin: float = 0.05
     start_places: int = 2  # places from which the fit of a random force starts
     start_points: int = 4  # named points at which it is tried
-    finalists: int = 4  # effects that are fitted to whole records through its whitening filter
-    joint_fits: int = 3  # of these, effects that are fitted jointly with it
+    joint_fits: int = 3  # effects, fitted through its whitening filter, that are then fitted jointly with it
     max_effects_beside: int = 2  # effects that are added one by one beside it, at most
-    other_sets: int = 2  # other sets of effects with which a random force is tried
     max_alternations: int = 4  # alternations between its fit and that of effects or nominal errors, at most
-    tolerance: float = 0.02  # relative decrease of the cost below which the alternation ends
     # range of the unmodelled force's rms over records, relative: that of forces in the rig follows the input level
     max_rms_spread: float = 0.5
     # of the first elastic frequency: below it, sensors of rates hardly observe a force, and its estimate drifts
@@ -133,8 +137,8 @@ class InputSettings:
     # times the sensor noise power: the residual above it must be larger for input noise to be estimated; less does not
     # matter to a mean square
     least_residual: float = 0.5
-    max_mean_square: float = 2.0  # mean square of the whitened residual up to which input noise is accepted
-    min_mean_square: float = 0.8  # likewise: if it is smaller, the input noise was overestimated
+    # mean square of the whitened residual: if it is smaller, the input noise was overestimated
+    min_mean_square: float = 0.8
     # of the residual power without input noise: up to this, nominal errors may have over-fitted it and are refitted
     over_fitted_share: float = 0.1
     noise_updates: int = 2  # updates of the sensor noise with input noise given
@@ -147,9 +151,7 @@ class RecordSettings:
     # relative deviations at which the cost is evaluated; a parabola interpolates
     deviations: tuple[float, ...] = (-0.02, -0.01, -0.005, -0.002, 0.0, 0.002, 0.005, 0.01, 0.02)
     least_removed_share: float = 0.3  # share of the residual power above the noise that the deviations must remove
-    max_residual: float = 0.5  # of the residual power without: largest residual with a parameter that varies
     max_ratio: float = 0.9  # of the residual power with a varying stiffness: another parameter must leave less
-    standard_errors: float = 4.0  # standard errors by which two records must differ
 
 
 @dataclass(frozen=True)
@@ -161,15 +163,15 @@ class ErrorSettings:
     # likewise, if only one of them is present
     max_uniform_alone: tuple[tuple[str, float], ...] = (("modulus_error", 0.015), ("modal_damping", 0.25))
     min_delay: float = 0.01  # of a sample: a sensor that is late by less counts as on time
-    standard_errors: float = 4.0  # standard errors by which a sensor must be late
+    standard_errors: float = 4.0  # by which a sensor must be late, or two records differ
     several_sensors: int = 3  # sensors: among so many, one alone is hardly late by chance
     coincidence_probability: float = 1e-3  # probability that independent delays agree as closely
-    # logarithm of a gain: a larger error is an effect, if it is also `outlying` times the rms of the other gains. Of
+    # logarithm of a gain: a larger error is an effect, if it is also `outlier_ratio` times the rms of the others. Of
     # ten gains calibrated to 2 %, one is so by chance in 1.7 % of draws, and beyond 5 % alone in 12 %; to 1 %, in none
     max_gain: float = 0.05
     outlier_ratio: float = 4.0
     max_misplacement: float = 0.01  # of the extent: an actuator or sensor that is farther off its place is an effect
-    # of most_gain and most_moved: larger errors are tested, since one that is wrong biases others
+    # of max_gain and max_misplacement: larger errors are tested, since one that is wrong biases others
     tested_share: float = 0.4
     max_wrong_transducers: int = 2  # gains and places that are tested
     # standard errors: an effect whose interval reaches the errors of a careful model may be one
@@ -180,11 +182,8 @@ class ErrorSettings:
 class PlainSettings:
     """Constants of few effects in place of many nominal errors."""
 
-    iterations: int = 8  # iterations without nominal errors
-    first_iterations: int = 3  # of these, iterations before fits far from the best are dropped
-    max_residual: float = 2.0  # times the noise power on the most informative records: fits above it go no further
+    first_iterations: int = 3  # of `FIT.iterations`, before fits far from the best are dropped
     likelihood_ratio: float = 6.0  # twice the log-likelihood ratio that one more parameter may gain by chance
-    additional_kinds: int = 4  # kinds that are tried as the one additional effect
 
 
 @dataclass(frozen=True)
@@ -254,8 +253,6 @@ class JointSettings:
     # of a sample: an accelerometer that is later stays on its side of the input steps when an effect is added; a
     # smaller delay may have been due to the gap
     certain_delay: float = 0.05
-    # times the noise power one step ahead: if nominal errors alone leave more, delays by interpolation are tried
-    interpolation_residual: float = 2.0
     # of a sample: delays and leads of accelerometers that are tried, to find the side of the input steps they read
     delays: tuple[float, ...] = (0.1, 0.25, 0.5)
     # ratio of the power of the change just after a sample to that just before it, at a jump
@@ -274,10 +271,6 @@ class StepwiseSettings:
     # saved, by masses and losses of stiffness 34 to 39
     saved_nats_alone: float = 25.0
     singles: int = 3  # single effects that are tried as the first
-    candidates: int = 4  # sets fitted to the most informative records at each step
-    # finalists, max_cost_ratio: sets that are fitted to all records, and the largest ratio of their cost to the least
-    finalists: int = 2
-    max_cost_ratio: float = 2.0
     max_effects: int = 4  # effects of a set; no case of the format has more than three
     # share of the residual power above the noise, with nominal errors alone, that the first effect must remove. On
     # practice cases the right one removes over 0.9, the best wrong one under 0.1
@@ -293,22 +286,15 @@ class StepwiseSettings:
     smaller_increase: float = 0.3  # likewise, for a set with one effect less
     # of the nominal gap's power: a larger residual is not due to errors of single modes
     mode_error_share: float = 0.1
-    # of the residual above the noise: errors of each mode that leave less are searched further
-    mode_error_residual: float = 0.5
-    explained_share: float = 0.01  # of the nominal gap's power above the noise: largest residual of an explanation
-    further_share: float = 1e-3  # likewise: a larger residual calls for another effect
-    # likewise: largest residual of one effect without nominal errors that is named although errors must be implausibly
-    # large to explain the records. Of 21 trials without an effect, the best single one left over 0.06 of the gap; of 38
-    # others, one left 0.013 and was named at 0.02. A mass on a frame leaves 0.007
-    single_effect_share: float = 0.01
+    # of the nominal gap's power above the noise: a larger residual calls for another effect
+    further_share: float = 1e-3
     # likewise: largest residual of several effects that are named; the budget decides whether they explain the gap
     several_effects_share: float = 0.2
     # excess of the residual over the noise power that still counts as noise: a tenth of the noise by amplitude is 0.2
     noise_excess: float = 0.15
-    # likewise, what nominal errors alone leave without any effect: under 0.02 in 40 trials
+    # likewise, what nominal errors alone leave without any effect, under 0.02 in 40 trials; and largest change of the
+    # readings with twice the substeps
     noise_floor: float = 0.05
-    # likewise, change of the readings with twice the substeps: if it is larger, finer ones are used
-    integration_error: float = 0.05
     min_probability: float = 1e-3  # probability below which another set is no alternative
     # of the nominal gap's power: with a larger residual, a fit that began one step ahead may have diverged
     diverged_share: float = 0.02
@@ -318,18 +304,14 @@ class StepwiseSettings:
 class PairSettings:
     """Constants of the search for pairs of effects."""
 
-    finalists: int = 4  # pairs that are fitted to whole records when all are searched at once
-    finalists_beside: int = 2  # likewise with one effect given
     diverged_cost: float = 1e4  # times the gap's power: the simulation diverges
     # relative change of a parameter: beyond, half of a pair differs from the effect tried alone
     parameter_change: float = 0.1
-    improvement_ratio: float = 0.5  # of the residual of another near miss: below, the same search is repeated
     same_minimum_ratio: float = 1.1  # of the residual of another fit of the set: below, both converge to the same end
     # of the gap's power: below, simpler forms of a set and other places are tried before other effects
     near_share: float = 0.2 * 0.1
     max_residual_share: float = 0.3  # of the gap's power: a pair with a smaller residual may be two of three effects
     exchanges: int = 2  # rounds in which either half of the best pair is kept and the other exchanged
-    relocated_pairs: int = 2  # best pairs that are tried from other places
     max_sets: int = 4  # best sets that may be named or be alternatives
 
 
@@ -338,18 +320,12 @@ class AttributionSettings:
     """Constants of the whole search, from single effects to the verdict."""
 
     finalists: int = 8  # single effects that are fitted to whole records
-    # times the cost of the best: finer substeps bring no worse set to the noise floor before it
-    max_cost_ratio: float = 2.0
-    joint_iterations: int = 8  # iterations of effects with errors of an identified rig
     first_iterations: int = 2  # iterations if there may be no effect at all
-    other_laws: int = 2  # one-step-ahead fits of a law beyond the catalogue that are continued on whole records
     shown_singles: int = 7  # other single effects that are fitted only for display
     tenth_louder: float = 1.1**2 - 1.0  # excess power of noise that is a tenth larger in amplitude
-    # of the gap's power: largest residual of an effect that leaves only more noise than stated
-    noise_share: float = 0.01
-    # likewise of modes that are missing and are added before another effect is sought: a cantilever by finite elements
-    # with a spring to ground left 0.06, and without them an added mass was named. One with an added mass of 3 % left
-    # 0.8, and the number of modes was wrong
+    # of the gap's power: largest residual of missing modes that are added before another effect is sought: a cantilever
+    # by finite elements with a spring to ground left 0.06, and without them an added mass was named. One with an added
+    # mass of 3 % left 0.8, and the number of modes was wrong
     mode_share: float = 0.3
     # relative tolerance of the cost: smaller differences do not show on an axis of decades
     cost_tolerance: float = 0.01

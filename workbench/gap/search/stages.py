@@ -19,7 +19,7 @@ from workbench.gap.search.other_errors import with_mode_errors, with_record_devi
 from workbench.gap.search.pairs import Pairs
 from workbench.gap.search.screening import Screening, on_whole_records, one_more
 from workbench.gap.search.search import Decision, Search, most_informative, nearest, promise
-from workbench.gap.search.settings import ATTRIBUTION, PAIRS, RANDOM, SEARCH, SELECTION, STEPWISE
+from workbench.gap.search.settings import ATTRIBUTION, FIT, PAIRS, RANDOM, SEARCH, SELECTION, STEPWISE
 from workbench.gap.search.stepwise import Stepwise
 from workbench.gap.search.with_random_force import decide_on_random, random_with_effects, random_with_nominal_errors
 from workbench.rig.simulate import is_stepped
@@ -122,7 +122,7 @@ class Stages:
             return None
         missing = [effect for effect in NO_UNIFORM_ERROR if effect.kind not in {e.kind for e in effects}]
         if len(missing) == 1:  # an imperfect model has both uniform errors, and a damper may stand for one of damping
-            both = fit(search.rig, (*effects, *missing), search.data, iterations=ATTRIBUTION.joint_iterations)
+            both = fit(search.rig, (*effects, *missing), search.data, iterations=FIT.iterations)
             if search.surely_better(both, decision.best.cost, 1):
                 return None
         return self._if_significant(decision)
@@ -151,7 +151,7 @@ class Stages:
             return replace(candidate, cost=float(by_channel.mean()), cost_by_channel=by_channel)
 
         fits = [in_louder(f) for f in self.singles]
-        promising = [f for f in fits if louder.explains(f) or louder.near(f, ATTRIBUTION.noise_share)]
+        promising = [f for f in fits if louder.explains(f) or louder.near(f, SEARCH.explained_share)]
         decision = _decide_on_singles(louder, in_louder(self.start), promising)[0] if promising else None
         if decision is None or decision.outcome != "explained":
             return None
@@ -380,7 +380,7 @@ def _decide_on_singles(search: Search, start: Fit, singles: list[Fit]) -> tuple[
 
 def _finished_best(search: Search, fits: Sequence[Fit]) -> list[Fit]:
     """The fits; those that more iterations or finer substeps may bring to the noise floor are refined."""
-    promising = [f for f in fits if f.cost < ATTRIBUTION.max_cost_ratio * fits[0].cost]
+    promising = [f for f in fits if f.cost < SEARCH.max_cost_ratio * fits[0].cost]
     if fits and search.explains(fits[0]):
         near = fits[0].cost + SEARCH.alternative_margin
         promising = [
@@ -405,7 +405,7 @@ def _forces_of_other_laws(search: Search, reconstruction: ForceReconstruction, m
     """Forces at one point of a law beyond the catalogue, best first, that cost less than `most` one step ahead."""
     beyond = replace(search, catalogue=BEYOND)
     promising = [f for f in one_more(beyond, (), reconstruction) if f.cost < most]
-    return on_whole_records(beyond, promising, ATTRIBUTION.other_laws, to_cost=search.cost_limit)
+    return on_whole_records(beyond, promising, SEARCH.few_finalists, to_cost=search.cost_limit)
 
 
 def _as_catalogue_kind(search: Search, law: Fit) -> Fit:

@@ -48,7 +48,7 @@ from workbench.gap.search.jointly import (
 from workbench.gap.search.plain import few_with_uniform_errors, in_place_of_nominal_errors, other_delay_causes
 from workbench.gap.search.screening import fitted_ahead, one_more
 from workbench.gap.search.search import Alternatives, Decision, Search, apart, best_of_each_kind, most_informative
-from workbench.gap.search.settings import FINISH, INPUTS, PLAIN, SEARCH, SELECTION, STEPWISE
+from workbench.gap.search.settings import FINISH, INPUTS, SEARCH, SELECTION, STEPWISE
 from workbench.rig.simulate import is_stepped
 from workbench.structure.domain import Location
 
@@ -113,7 +113,7 @@ class Stepwise:
     @property
     def closes_gap(self) -> bool:
         """Whether the residual of the last set is at the noise floor, or a negligible share of the gap."""
-        return self.is_noise_only or self.unexplained < STEPWISE.explained_share
+        return self.is_noise_only or self.unexplained < SEARCH.explained_share
 
     @property
     def is_noise_only(self) -> bool:
@@ -195,7 +195,7 @@ class Stepwise:
             fits_as_well = {f.key for f in found if f.cost < (1.0 + SEARCH.significant_gain) * single.cost}
             if not limiting_cases & fits_as_well:
                 chosen.append(single)
-        chosen = [f for f in chosen[: STEPWISE.singles] if f.cost < STEPWISE.max_cost_ratio * chosen[0].cost]
+        chosen = [f for f in chosen[: STEPWISE.singles] if f.cost < SEARCH.max_cost_ratio * chosen[0].cost]
         # nominal errors may have absorbed an effect, so the best ones without nominal errors are tried too
         alone = [f for f in self.ahead[:1] if not may_be_transducer_errors(search, f.effects)]
         for single in (*linear[:1], *alone):
@@ -314,9 +314,7 @@ class Stepwise:
         search, best = self.search, singles[0]
         if not (self.is_noise_only or best.cost < self.last.fit.cost):
             return False
-        if not search.near(best, STEPWISE.single_effect_share) or any(
-            effect.kind in UNIFORM for effect in best.effects
-        ):
+        if not search.near(best, SEARCH.explained_share) or any(effect.kind in UNIFORM for effect in best.effects):
             return False
         errors = with_reading_sides(search, nominal_errors(search.rig, search.prior), best.effects)
         found = fit_jointly(search, best.effects, errors, until_convergence=True)
@@ -353,7 +351,7 @@ class Stepwise:
         if self.plain is not None:
             return
         with_uniform = with_uniform_effects(self.search, self.last)
-        self.steps.append(with_delay_as_effect(self.search, with_uniform, STEPWISE.explained_share * self._gap))
+        self.steps.append(with_delay_as_effect(self.search, with_uniform, SEARCH.explained_share * self._gap))
         if self.last.effects:
             self.steps.append(
                 fit_jointly(self.search, self.last.effects, self.last.errors, rounds=3, until_convergence=True)
@@ -368,7 +366,7 @@ class Stepwise:
         length_limit = errors_only.description(noise) - STEPWISE.saved_nats_beside_plausible
         if length_limit < 0.0:
             return
-        sets = [f.effects for f in self._linear_singles[: STEPWISE.finalists]]
+        sets = [f.effects for f in self._linear_singles[: SEARCH.few_finalists]]
         fitted = self.search.in_parallel(fit_from_zero, sets)
         tried = [s for s in fitted if s.is_plausible and not may_be_transducer_errors(self.search, s.effects)]
         shorter = [s for s in tried if s.description(noise) < length_limit]
@@ -467,7 +465,7 @@ class Stepwise:
             if f.effects[0].at is not None and is_tried(f.effects[0]) and key not in contained(f.effects, search.rig)
         ]
         cost_limit = min((f.cost for f in fitted_ahead(with_errors, [step.effects])), default=np.inf)
-        likeliest = [f for f in best_of_each_kind(others) if f.cost < cost_limit][: STEPWISE.finalists]
+        likeliest = [f for f in best_of_each_kind(others) if f.cost < cost_limit][: SEARCH.few_finalists]
         fitted = search.workers.map(lambda f: fit_jointly(search, f.effects, step.errors, rounds=2), likeliest)
         best, *rest = sorted((step, *fitted), key=partial(loss, search))
         return replace(best, others=(best, *rest)) if best is not step and self._is_accepted(best, step) else None
@@ -485,7 +483,7 @@ class Stepwise:
         places = [(effect.moved_to(where),) for where in other_places(effect, domain)]
         here, *others = fitted_to_quick(self.search, [(effect,), *places], step)
         elsewhere = [s for s in others if apart(s.effects[0], here.effects[0], domain)]
-        near = _finalists(sorted(elsewhere, key=lambda s: s.fit.cost), STEPWISE.max_cost_ratio * here.fit.cost)
+        near = _finalists(sorted(elsewhere, key=lambda s: s.fit.cost), SEARCH.max_cost_ratio * here.fit.cost)
         whole = self.search.in_parallel(fitted_to_all, near)
         best = min(whole, key=partial(loss, self.search), default=step)
         return best if loss(self.search, best) < loss(self.search, step) else None
@@ -500,7 +498,7 @@ class Stepwise:
             return None
         self.search.progress("effects that errors of the model have absorbed", 0.6)
         named = {effect.kind for effect in step.effects}
-        singles = [f.effects for f in self._linear_singles if f.effects[0].kind not in named][: STEPWISE.finalists]
+        singles = [f.effects for f in self._linear_singles if f.effects[0].kind not in named][: SEARCH.few_finalists]
         tried = self.search.in_parallel(fit_from_zero, [(*step.effects, *each) for each in singles])
         noise = step.noise_power
         longest = step.description(noise) - STEPWISE.saved_nats
@@ -551,7 +549,7 @@ class Stepwise:
             same_kind = sum(candidate.effects[-1].kind is others[-1].kind for others in chosen)
             if candidate.cost <= promising and same_kind < (2 if candidate.cost <= as_good else 1):
                 chosen.append(candidate.effects)
-        chosen = [*chosen[: STEPWISE.candidates], *more_general_sets(step.effects)]
+        chosen = [*chosen[: SEARCH.finalists], *more_general_sets(step.effects)]
         return fitted_to_quick(self.search, chosen, step)
 
     def _best_of(self, tried: Sequence[JointFit], step: JointFit) -> JointFit:
@@ -560,7 +558,7 @@ class Stepwise:
         singles = [] if step.effects else self.fitted_singles
         search = self.search
         tried = sorted((s for s in tried if not may_be_transducer_errors(search, s.effects)), key=partial(loss, search))
-        near = _finalists(tried, STEPWISE.max_cost_ratio * tried[0].fit.cost) if tried else []
+        near = _finalists(tried, SEARCH.max_cost_ratio * tried[0].fit.cost) if tried else []
         whole = search.workers.map(lambda s: without_inactive(search, fitted_to_all(search, s)), near)
         # the most informative records overstate some
         whole = [s for s in whole if not may_be_transducer_errors(search, s.effects)]
@@ -622,7 +620,7 @@ class Stepwise:
         if found is self.last:
             return False
         # a lag of all channels weakens what is quick, which a gain may stand for
-        late = with_delay_as_effect(self.search, self.last, STEPWISE.explained_share * self._gap)
+        late = with_delay_as_effect(self.search, self.last, SEARCH.explained_share * self._gap)
         is_late = late is not self.last and loss(self.search, late) < loss(self.search, found)
         self.steps.append(late if is_late else found)
         return True
@@ -668,7 +666,7 @@ class Stepwise:
         tried = [
             s for s in self._candidates_with_one_more(step) if not may_be_transducer_errors(self.search, s.effects)
         ]
-        near = _finalists(sorted(tried, key=lambda s: s.fit.cost), PLAIN.max_residual)
+        near = _finalists(sorted(tried, key=lambda s: s.fit.cost), SEARCH.near_noise)
         whole = self.search.in_parallel(fitted_to_all, near)
         found = [s for s in whole if s.explains and s.is_plausible and self._is_accepted(s, step)]
         if not found:
@@ -696,7 +694,7 @@ class Stepwise:
         while substeps < FINISH.substeps:
             finer = data.stepped(2 * substeps).residual(rig)
             change, residual = finer - residual, finer
-            if float(change @ change) < STEPWISE.integration_error * change.size:
+            if float(change @ change) < STEPWISE.noise_floor * change.size:
                 break
             substeps *= 2
         if substeps == data.substeps:
@@ -770,4 +768,4 @@ def _law_of(step: JointFit) -> Effect | None:
 
 def _finalists(steps: Sequence[JointFit], cost_limit: float) -> list[JointFit]:
     """The first of some steps that cost less than a limit on the most informative records."""
-    return [step for step in steps if step.fit.cost < cost_limit][: STEPWISE.finalists]
+    return [step for step in steps if step.fit.cost < cost_limit][: SEARCH.few_finalists]

@@ -18,7 +18,7 @@ from workbench.gap.search.fit import Fit, cost_of, fit, parameters_of
 from workbench.gap.search.jointly import JointFit, fit_jointly
 from workbench.gap.search.screening import on_whole_records, one_more
 from workbench.gap.search.search import Decision, Search, best_of_each_kind
-from workbench.gap.search.settings import INTERVALS, RANDOM, SEARCH, STEPWISE
+from workbench.gap.search.settings import INTERVALS, JOINT, RANDOM, SEARCH
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
 from workbench.structure.domain import Between, NamedPoints
@@ -106,7 +106,7 @@ def random_with_effects(search: Search, found: Sequence[Fit]) -> Decision | None
     If none holds but one is near, a further effect is tried with it.
     """
     tried, searches = [], []
-    for given in best_of_each_kind(found)[: RANDOM.other_sets]:
+    for given in best_of_each_kind(found)[: SEARCH.few_finalists]:
         unclipped, reconstruction = _without_clipped(search, given.effects, search.reconstruction_with(given.effects))
         reconstruction = _with_laws_on_measured_motion(unclipped, reconstruction)
         if looks_random(reconstruction):
@@ -163,10 +163,10 @@ def random_with_nominal_errors(search: Search, step: JointFit, *, surely: bool =
         step = fit_jointly(whitened, step.effects, step.errors)
         reconstruction = _reconstruction_with(search, step.fit.effects)
         found, random = _random_given(search, step.fit, reconstruction)
-        if random.cost > (1.0 - RANDOM.tolerance) * before:
+        if random.cost > (1.0 - JOINT.round_tolerance) * before:
             break
     cost = cost_of(search.rig, step.fit.effects, search.data)
-    is_closed = random.left - 1.0 < STEPWISE.explained_share * cost
+    is_closed = random.left - 1.0 < SEARCH.explained_share * cost
     is_noticeable = cost - 1.0 > SEARCH.negligible_share * float(search.nominal.mean())
     holds = is_closed and is_noticeable and random.is_steady and looks_random(reconstruction)
     return Decision("explained", found, random) if holds else None
@@ -192,7 +192,7 @@ def _improving(
     cost, n_given = cost_of(whitened.rig, given, whitened.data), len(parameters_of(search.rig, given))
 
     def fitted(reconstruction: ForceReconstruction) -> list[Fit]:
-        fits = on_whole_records(whitened, one_more(whitened, given, reconstruction), RANDOM.finalists)
+        fits = on_whole_records(whitened, one_more(whitened, given, reconstruction), SEARCH.finalists)
         return [f for f in fits if whitened.surely_better(f, cost, f.n_parameters - n_given)]
 
     found = fitted(reconstruction)
@@ -257,7 +257,7 @@ def _fitted_with_random(search: Search, given: Fit, reconstruction: ForceReconst
         given = replace(refitted, cost_by_channel=search.data.by_channel(search.data.residual(reconstruction.rig)))
         reconstruction = _with_laws_on_measured_motion(search, reconstruction, observer)
         found = _random_given(search, given, reconstruction)
-        if found.random.cost > (1.0 - RANDOM.tolerance) * before:
+        if found.random.cost > (1.0 - JOINT.round_tolerance) * before:
             break
     return found
 
