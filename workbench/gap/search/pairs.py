@@ -74,8 +74,8 @@ class Pairs:
         """Whether the best pair one step ahead and a third effect explain the records.
 
         Two of three strong effects may be far from the records as a whole. One step ahead each must remove half of what
-        the others leave. Then each is sought again beside the two others: a pair found without the third effect may
-        have a wrong law or place.
+        the others leave; two of them may leave as little as the three. Else each is sought again beside the two others:
+        a pair found without the third effect may have a wrong law or place.
 
         Args:
             single: cost of the best single effect, one step ahead.
@@ -91,8 +91,14 @@ class Pairs:
         three = one_more(search, pair.effects, search.reconstruction_with(pair.effects))
         if not three or three[0].cost - 1.0 > SEARCH.halved * (pair.cost - 1.0):
             return False
-        for two in list(each_left_out(three[0].effects)):
-            three = [*three, *one_more(search, two, search.reconstruction_with(two))]
+        twos = list(each_left_out(three[0].effects))
+        pairs = fitted_ahead(search, twos)
+        if pairs and pairs[0].cost < three[0].cost + SEARCH.alternative_margin and self._add_and_check(pairs):
+            return True
+        for two in twos:
+            # beside nearly the pair from which the third was sought, it would be found again
+            if not all(any(_are_nearly_equal(one, other) for other in pair.effects) for one in two):
+                three = [*three, *one_more(search, two, search.reconstruction_with(two))]
         return self._add_and_check(sorted(three, key=lambda f: f.cost))
 
     def _explained_with_one_more(self, given: tuple[Effect, ...]) -> bool:
