@@ -127,9 +127,9 @@ def decays(record: Record) -> bool:
     about = record.outputs - record.outputs[:, -max(record.n_samples // 10, 1) :].mean(axis=1, keepdims=True)
     tenths = [float((part**2).mean()) for part in np.array_split(about, 10, axis=1) if part.size]
     falling = tenths[int(np.argmax(tenths)) :]
-    if tenths[-1] < DECAYING.decayed**2 * max(tenths):
-        return True
-    return (len(falling) >= DECAYING.falling and bool(np.all(np.diff(falling) < 0))) or _explained(record)
+    is_at_rest = tenths[-1] < DECAYING.decayed**2 * max(tenths)
+    falls = len(falling) >= DECAYING.falling and (np.diff(falling) < 0).all()
+    return bool(is_at_rest or falls or _explained(record))
 
 
 def _explained(record: Record) -> bool:
@@ -142,14 +142,7 @@ def _explained(record: Record) -> bool:
     energy = [float((part**2).sum()) for part in np.array_split(outputs, 2, axis=1)]
     if not energy[1] < energy[0]:
         return False
-    part = replace(
-        after,
-        outputs=outputs,
-        inputs=np.zeros((0, 0)),
-        input_channels=(),
-        output_channels=after.output_channels[sensors],
-        sample_time=stride * after.sample_time,
-    )
+    part = Record(stride * after.sample_time, outputs, after.output_channels[sensors])
     try:
         poles = stacked_delays(part, n_modes=DECAYING.modes).poles
     except ValueError:  # too short
@@ -223,9 +216,7 @@ def _scaled(record: Record) -> tuple[np.ndarray, float]:
 def _breaks(y: np.ndarray, rounding: float) -> tuple[np.ndarray, np.ndarray]:
     """Squared backward prediction error over its level, (n_samples,), and which samples are breaks, (n_samples,).
 
-    Args:
-        y: (n_signals, n_samples).
-        rounding: variance of quantisation noise.
+    Of signals y (n_signals, n_samples) with quantisation noise of variance `rounding`.
     """
     m, n = y.shape
     order, block = START.order, START.block
@@ -271,14 +262,10 @@ def _dying_away(ratio: np.ndarray, broken: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Columns:
-    """Functions of time whose span is the same after a shift in time: one table serves all parts of a long record.
+    """Functions of time whose span is the same after a shift in time: one table serves all parts of a long record."""
 
-    Attributes:
-        table: (at most PART, n_columns) functions of the samples of a part.
-        shift: T(s), (n_columns, n_columns), of the first sample s of a part: the columns there are table @ T(s).
-    """
-
-    table: np.ndarray
+    table: np.ndarray  # (at most PART, n_columns) functions of the samples of a part
+    # T(s), (n_columns, n_columns), of the first sample s of a part: the columns there are table @ T(s)
     shift: Callable[[int], np.ndarray]
 
     @staticmethod
@@ -378,8 +365,7 @@ def without_drift(record: Record, poles: np.ndarray, *, most: int = HIGHEST_DEGR
     outputs replaces the polynomial where it is likelier.
 
     Args:
-        record: free decay.
-        poles: (n_modes,) of its modes, rad/s; may be empty.
+        poles: (n_modes,) of the modes of the free decay, rad/s; may be empty.
         most: highest degree.
     """
     n, m, dt = record.n_samples, record.n_outputs, record.sample_time

@@ -73,14 +73,8 @@ def data_faults(record: Record) -> tuple[DataFault, ...]:
     dead = list(_dead(record))
     names = {fault.outputs[0] for fault in dead}
     alive = [j for j, name in enumerate(record.output_names) if name not in names]
-    return (
-        *dead,
-        *_copied(record, alive),
-        *_clipped(record, alive),
-        *_upsampled(record, alive),
-        *_unstated(record, alive),
-        *input_faults(record),
-    )
+    of_outputs = (fault for test in (_copied, _clipped, _upsampled, _unstated) for fault in test(record, alive))
+    return (*dead, *of_outputs, *input_faults(record))
 
 
 def input_faults(record: Record) -> tuple[DataFault, ...]:
@@ -91,25 +85,15 @@ def input_faults(record: Record) -> tuple[DataFault, ...]:
     """
     faults = []
     for channel, row in zip(record.input_channels, record.inputs, strict=True):
-        stops = [
-            at
-            for at in _piled(row).values()
-            if at.size
-            and row[at[0]]
-            and _piles_up(row, at, DATA.least_piled_input, DATA.piled_input)
-            and not _has_levels(row, at)
-        ]
+        piled = [a for a in _piled(row).values() if _piles_up(row, a, DATA.least_piled_input, DATA.piled_input)]
+        stops = [at for at in piled if row[at[0]] and not _has_levels(row, at)]
         if stops:
             ends, count = " and ".join(f"{row[at[0]]:g}" for at in stops), sum(at.size for at in stops)
-            faults.append(
-                DataFault(
-                    "clipped",
-                    (),
-                    f"input {channel.name!r} is clipped at {ends}, {count} samples: unless it was sent like that, the"
-                    " input beyond is lost, and modes, their masses above all, are wrong; measure with a larger range",
-                    inputs=(channel.name,),
-                )
+            message = (
+                f"input {channel.name!r} is clipped at {ends}, {count} samples: unless it was sent like that, the input"
+                " beyond is lost, and modes, their masses above all, are wrong; measure with a larger range"
             )
+            faults.append(DataFault("clipped", (), message, inputs=(channel.name,)))
     return tuple(faults)
 
 
@@ -120,17 +104,12 @@ def check_data_quality(record: Record) -> None:
         ValueError: the first of `data_faults` that is one of outputs.
     """
     for fault in data_faults(record):
-        if fault.inputs:
-            continue
-        raise ValueError(f"record {record.name!r}: {fault.message}")
+        if not fault.inputs:
+            raise ValueError(f"record {record.name!r}: {fault.message}")
 
 
 def check_outputs_move(records: Sequence[Record]) -> None:
-    """Refuse an output that is constant in every record, of the same outputs.
-
-    Raises:
-        ValueError: naming the output.
-    """
+    """Refuse an output that is constant in every record, of the same outputs, by a ValueError that names it."""
     for name, *rows in zip(records[0].output_names, *(record.outputs for record in records), strict=True):
         if not any(np.ptp(row) for row in rows):
             raise ValueError(f"output {name!r} stays at {rows[0][0]:g}: the sensor is dead; leave it out")
@@ -283,12 +262,11 @@ def _copied(record: Record, alive: list[int]) -> Iterator[DataFault]:
             difference = scaled[i] - np.sign(alike[row, others])[:, None] * scaled[first + others]
             for j in (first + others[np.sqrt((difference**2).mean(axis=1)) < DATA.copied * noise]).tolist():
                 copies.add(j)
-                yield DataFault(
-                    "copied",
-                    (names[i], names[j]),
+                message = (
                     f"outputs {names[i]!r} and {names[j]!r} are the same signal, its noise included, which would count"
-                    " twice; leave one out",
+                    " twice; leave one out"
                 )
+                yield DataFault("copied", (names[i], names[j]), message)
 
 
 def _innovation_std(row: np.ndarray) -> float:
@@ -308,13 +286,11 @@ def _clipped(record: Record, alive: list[int]) -> Iterator[DataFault]:
         if clear:
             # Where one end of the range is too small, so may be the other: two equal samples are enough there.
             at, last = piled[clear[0]], float(record.time[max(a[-1] for a in piled.values() if a.size > 1)])
-            yield DataFault(
-                "clipped",
-                (name,),
+            message = (
                 f"output {name!r} is clipped {clear[0]} at {row[at[0]]:g}, {at.size} samples; up to {last:g} s motion"
-                " beyond the range is lost and would be read as modes; begin later, or measure with a larger range",
-                until=last,
+                " beyond the range is lost and would be read as modes; begin later, or measure with a larger range"
             )
+            yield DataFault("clipped", (name,), message, until=last)
 
 
 def _piled(row: np.ndarray) -> dict[str, np.ndarray]:
@@ -350,13 +326,12 @@ def _upsampled(record: Record, alive: list[int]) -> Iterator[DataFault]:
             every = int(np.gcd.reduce(np.diff(changes))) if changes.size >= DATA.fewest_changes else 1
             # An output that rests for long has changes that are far apart too, but few.
             if 1 < every <= DATA.slowest and changes.size > 0.5 * (np.ptp(changes) // every):
-                yield DataFault(
-                    "upsampled",
-                    (name,),
+                message = (
                     f"output {name!r} changes once in {every} samples only: it was sampled at"
                     f" {record.sample_rate_hz / every:g} Hz and {how}, not at {record.sample_rate_hz:g} Hz; leave it"
-                    " out, or bring all outputs to that rate",
+                    " out, or bring all outputs to that rate"
                 )
+                yield DataFault("upsampled", (name,), message)
                 break
 
 
@@ -365,16 +340,12 @@ def _unstated(record: Record, alive: list[int]) -> Iterator[DataFault]:
     moving = [channel for channel in channels if channel.quantity in MEASURED]
     for channel in channels:
         if moving and not channel.quantity:
-            unit = unknown_unit(channel.name)
-            stated = f"states the unit {unit}, which is not known" if unit else "states no quantity"
-            remedy = (
-                f"write its numbers in a known unit, one of {LIKELY}"
-                if unit
-                else f"state its unit in the file, as in '{channel.name} [m/s^2]'"
-            )
-            yield DataFault(
-                "unstated",
-                (channel.name,),
+            stated, remedy = "states no quantity", f"state its unit in the file, as in '{channel.name} [m/s^2]'"
+            if unit := unknown_unit(channel.name):
+                stated = f"states the unit {unit}, which is not known"
+                remedy = f"write its numbers in a known unit, one of {LIKELY}"
+            message = (
                 f"output {channel.name!r} {stated}, and {moving[0].name!r} measures {moving[0].quantity}: it would be"
-                f" taken for a displacement; {remedy}, or leave it out",
+                f" taken for a displacement; {remedy}, or leave it out"
             )
+            yield DataFault("unstated", (channel.name,), message)

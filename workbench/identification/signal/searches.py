@@ -30,8 +30,7 @@ SECONDS = 30.0  # processor time limit
 WHOLE = 0.995  # share of the time from which on a search counts as ended by the limit as a whole
 FURTHER = "search for further modes"
 STOPPED = "stopped after"  # first words of the remark on an exceeded time limit
-# Probability that a record of noise alone yields a mode.
-FALSE_ALARM = 1e-3
+FALSE_ALARM = 1e-3  # probability that a record of noise alone yields a mode
 
 
 @dataclass(frozen=True)
@@ -78,9 +77,7 @@ Progress = Callable[[str, float], None]
 class TimeLimit(Deadline):
     """A limit of processor time for an identification, and the searches that it ended early.
 
-    Attributes:
-        progress: called with the search under way and the share of the time that is spent.
-        unfinished: name of each search that was ended early, and the share of the whole time that had passed then.
+    `unfinished` holds the name of each search that was ended early, and the share of the whole time that had passed.
     """
 
     def __init__(self, seconds: float | None = None, progress: Progress | None = None) -> None:
@@ -153,11 +150,7 @@ DAMPING = DampingSettings()
 
 
 def check_count(name: str, number: int | None) -> None:
-    """Refuse a number of modes below one.
-
-    Raises:
-        ValueError: naming it.
-    """
+    """Refuse a number of modes below one, by a ValueError that names it."""
     if number is not None and number < 1:
         raise ValueError(f"{name} is a number of modes, 1 or more; got {number}")
 
@@ -184,14 +177,7 @@ class LeastSquares(Protocol[State]):
 
 @dataclass(frozen=True, eq=False)
 class Minimum(Generic[State]):
-    """The result of `minimise`.
-
-    Attributes:
-        state: of least cost.
-        cost: of this state.
-        converged: whether the search ended because the step was negligible.
-        steps: number of steps.
-    """
+    """The state of least cost, its cost, whether the last step was negligible, and the number of steps."""
 
     state: State
     cost: float
@@ -208,14 +194,10 @@ def minimise(
     time_limit: TimeLimit | None = None,
     is_vain: Callable[[State], bool] = lambda state: False,
 ) -> Minimum[State]:
-    """The local minimum of a problem next to `start`.
+    """The local minimum of a problem next to `start`, an admissible state.
 
     Args:
-        problem: see `LeastSquares`.
-        start: admissible.
-        most_steps: largest number of steps.
         round_off: of the cost; a step that raises it by no more is accepted.
-        time_limit: of processor time; none unless given.
         is_vain: whether a state ends the search, since what follows from it is of no use.
     """
     state, cost, damping, small = start, problem.cost(start), DAMPING.first, False
@@ -246,10 +228,6 @@ def minimise(
     return Minimum(state, cost, False, most_steps)
 
 
-Model = TypeVar("Model")
-Candidate = TypeVar("Candidate")
-
-
 class CachedResidual:
     """A function for the residual (n,) and its Jacobian (n, n_unknowns) that keeps its last value.
 
@@ -268,6 +246,10 @@ class CachedResidual:
         """The least squares unknowns, by at most so many evaluations; options of `scipy.optimize.least_squares`."""
         residual, jacobian = (lambda x: self(x)[0]), (lambda x: self(x)[1])
         return np.asarray(least_squares(residual, start, jacobian, x_scale="jac", max_nfev=most_tries, **options).x)
+
+
+Model = TypeVar("Model")
+Candidate = TypeVar("Candidate")
 
 
 class Selection(Protocol[Model, Candidate]):
@@ -359,16 +341,18 @@ class OrderSelection(Generic[Model, Candidate]):
         own_limit = self.time_limit.share(SELECTION.forward_share)
         if self.cut_short:
             self.time_limit.unfinished.pop(FURTHER, None)
-            self.cut_short = False
+        self.cut_short = False
         if self.forgets:
             self.rejected.clear()
         while (
             self.problem.n_modes(model) < self.max_modes
             and weak < self.most_weak
             and (self.most_splits is None or splits < self.most_splits)
-            # The first mode is searched whatever the time.
-            and not (self.problem.n_modes(model) and self._ends(own_limit))
         ):
+            # The first mode is searched whatever the time.
+            if self.problem.n_modes(model) and own_limit.spent(FURTHER):
+                self.cut_short = True
+                break
             candidate = self.problem.strongest(model, self.rejected)
             if candidate is None:
                 break
@@ -390,11 +374,6 @@ class OrderSelection(Generic[Model, Candidate]):
                 continue
             self.rejected.append((complex(pole), gain))
         return model
-
-    def _ends(self, own_limit: TimeLimit) -> bool:
-        """Whether the time of the forward search is up; sets `cut_short`."""
-        self.cut_short = own_limit.spent(FURTHER)
-        return self.cut_short
 
     def backward(self, model: Model) -> Model:
         """The model without modes of insignificant gain; the weakest goes first."""
@@ -429,16 +408,13 @@ def spurious_modes(
     """Which poles are overdamped, or split off a stronger mode of the same shape in the same band, (n_modes,).
 
     Args:
-        poles: (n_modes,) rad/s.
         shapes: (n_signals, n_modes) amplitudes over the noise, complex.
-        strength: (n_modes,); of two poles of one mode the weaker is spurious.
         bin_width: rad/s, the frequency resolution of the record.
         distinct: test whether modes r and s are two modes, for a single signal, which shows no shape.
     """
     band = np.abs(poles.real)[:, None] + np.abs(poles.real) + bin_width
     near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < band
-    damped = overdamped(poles)
-    # No mode splits off an overdamped pole, whose band is wide enough for any.
+    damped = overdamped(poles)  # no mode splits off such a pole, whose band is wide enough for any
     # A single signal shows no shape, and a mode that depends on amplitude looks like two there.
     others = len(shapes) - 1
     least_mac = max(SELECTION.same_shape, 1.0 - BY_CHANCE ** (1.0 / others)) if others else SELECTION.same_shape
