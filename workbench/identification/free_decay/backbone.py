@@ -111,8 +111,12 @@ class _Band:
     """
 
     def __init__(self, record: Record, pair: Complexes, others: Complexes) -> None:
-        record = while_it_lasts(record, pair, pair.size + others.size)
         dt = record.sample_time
+        # The record is cut to where the two modes have decayed.
+        last = BACKBONE.lasts / max(float(-pair.real.max()) * dt, 1e-300)
+        last = int(max(last, BACKBONE.samples_each * (pair.size + others.size)))
+        if last < record.n_samples - 1:
+            record = record.between(record.start_time, record.start_time + last * dt)
         half = band_about(pair, 2.0 * np.pi / (record.n_samples * dt))[1]
         self.step = max(int(min(record.n_samples / BACKBONE.few, BACKBONE.turns / (half * dt))), 1)
         if half > BACKBONE.narrow * float(pair.imag.min()):
@@ -166,15 +170,6 @@ class _Band:
         a, b = np.linalg.lstsq(r, along, rcond=1e-12)[0].reshape(2, p)[:, list(which)]
         columns = self.without_others(real[:, p:] * a + imaginary[:, p:] * b)
         return self.y - q @ along, -(columns - q @ (q.T @ columns))
-
-
-def while_it_lasts(record: Record, pair: np.ndarray, n_modes: int) -> Record:
-    """A free decay cut to where two of its modes, poles `pair` in rad/s, have decayed."""
-    last = BACKBONE.lasts / max(float(-pair.real.max()) * record.sample_time, 1e-300)
-    last = max(last, BACKBONE.samples_each * n_modes)
-    if last >= record.n_samples - 1:
-        return record
-    return record.between(record.start_time, record.start_time + int(last) * record.sample_time)
 
 
 def _modes_misfit(bands: Sequence[_Band], poles: Complexes) -> Floats:

@@ -78,7 +78,6 @@ class OrderSettings:
     # Least ratio of a decay rate to the frequency step of its transform: the exponential has decayed to e^-25 at the
     # end of the transform.
     coarser: float = 4.0
-    decided: float = 0.1  # predicted decrease of χ² below which a fit is precise enough to decide on a mode
     least_independent: float = 1e-7  # least share of a candidate outside the span of the model, to be distinguishable
     resolved: float = 1e-13  # share of the largest eigenvalue of a Gram matrix, below which a direction is round-off
     # bandwidths by which a mode selected in whitened records may move when refined in the records as measured
@@ -354,17 +353,14 @@ class _FreeDecay:
         A candidate may seem to split a mode only because other modes are missing from the model. The strongest
         candidate of each mode is tried again, all of them together.
         """
-        taken: list[int] = []
-        candidates: list[complex] = []
+        strongest: dict[int, complex] = {}
         for pole, _ in sorted(self.split_off, key=lambda candidate: -candidate[1]):
-            nearest = int(np.argmin(np.abs(model.poles.imag - pole.imag)))
-            if nearest not in taken:
-                taken, candidates = [*taken, nearest], [*candidates, pole]
+            strongest.setdefault(int(np.argmin(np.abs(model.poles.imag - pole.imag))), pole)
         self.split_off.clear()
         n, trial = model.poles.size, model
         with suppress(np.linalg.LinAlgError):
             spurious = np.zeros(0, bool)
-            trial = self.fitted(np.append(model.poles, candidates), model.weights, decide=True)
+            trial = self.fitted(np.append(model.poles, [*strongest.values()]), model.weights, decide=True)
             while trial.poles.size > n and (spurious := self._spurious(trial, trial)).any():
                 trial = self.fitted(trial.poles[~spurious], trial.weights, decide=True)
         return trial if trial.poles.size > n else model
@@ -423,7 +419,7 @@ class _FreeDecay:
 
         With `decide` only as precisely as a decision on a mode needs it.
         """
-        most_steps, enough = (SELECTION.few_steps, ORDER.decided) if decide else (FIT.most_steps, FIT.negligible)
+        most_steps, enough = (SELECTION.few_steps, SELECTION.decided) if decide else (FIT.most_steps, FIT.negligible)
         if poles.size:
             poles, fits, *_ = fitted_poles(
                 self.records, poles, weights, True, most_steps, enough=enough, time_limit=self.time_limit

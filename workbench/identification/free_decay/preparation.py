@@ -335,17 +335,11 @@ def _parts(n: int) -> Iterator[slice]:
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """A drift slower than any mode, or the exponential settling of sensors with a high-pass.
+    """A drift slower than any mode, or the exponential settling of sensors with a high-pass."""
 
-    Attributes:
-        record: without the drift; constants stay.
-        size: (n_outputs,) range of the drift, in the unit of each output; 0 where there is none.
-        time_constant: s, of exponential settling, as of an accelerometer with a high-pass; None of a polynomial drift.
-    """
-
-    record: Record = field(repr=False)
-    size: np.ndarray
-    time_constant: float | None = None
+    record: Record = field(repr=False)  # without the drift; constants stay
+    size: np.ndarray  # (n_outputs,) range of the drift, in the unit of each output; 0 where there is none
+    time_constant: float | None = None  # s, of exponential settling; None of a polynomial drift
 
     @property
     def words(self) -> str:
@@ -399,9 +393,8 @@ def without_drift(record: Record, poles: np.ndarray, *, most: int = HIGHEST_DEGR
         each = (drift_part.T @ tried[fixed:]) ** 2 / np.maximum((drift_part**2).sum(axis=0), 1e-300)[:, None]
         settles = gain(each, tried)
         best = int(np.argmax(settles))
-        best_rate = rates[best], settles[best]
+        rate, settling = rates[best], settles[best]
         rates = np.geomspace(rates[max(best - 1, 0)], rates[min(best + 1, rates.size - 1)], START.rates)
-    rate, settling = best_rate
     criterion = settling - penalty * (m + 1)
     of_polynomial = ratio[degree] - penalty * m * degree if likely else 0.0
     time_constant = None

@@ -1,10 +1,11 @@
-"""Data quality: lost samples; faulty channels, dead, copied, clipped, upsampled or of no stated quantity."""
+"""Data quality: lost or wrong samples; channels that are dead, copied, clipped, upsampled or of no stated quantity."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from workbench.arrays import Floats
 from workbench.records.record import Record, as_records
 from workbench.records.units import LIKELY, unknown_unit
 from workbench.rig.sensors import MEASURED
@@ -37,6 +38,11 @@ class DataSettings:
     straight: float = 1e-9  # rounding deviation of samples from a straight line, relative to the output's range
     moves: float = 100.0  # least motion from sample to sample there, in resolutions of the output
     block: int = 256  # outputs compared with all others at once: all pairs of 10,000 would take 800 MB
+    parts: int = 50  # into which a record is divided, in the search for a burst of the residual
+    samples: int = 10  # of each part at least
+    together: int = 3  # consecutive parts that hold the burst
+    share: float = 0.3  # of the residual energy in these at least, where noise has 0.06
+    times: float = 2.5  # the share expected from the motion in these, at least
 
 
 DATA = DataSettings()
@@ -191,12 +197,9 @@ def dropouts(record: Record) -> tuple[tuple[str, float, int, str], ...]:
 
 
 def dropout_remark(record: Record, after: str, *, before: float = np.inf) -> tuple[str, ...]:
-    """A remark on the dropouts of a record; empty where there are none.
+    """A remark on the dropouts of a record that begin before a time, s; empty where there are none.
 
-    Args:
-        record: the record.
-        after: second sentence of the remark: the consequence, and the way out.
-        before: s, dropouts that begin later are ignored.
+    Its second sentence, `after`, is the consequence, and the way out.
     """
     early = [dropout for dropout in dropouts(record) if dropout[1] < before]
     if not early:
@@ -206,6 +209,45 @@ def dropout_remark(record: Record, after: str, *, before: float = np.inf) -> tup
     return (
         f"in record {record.name!r} output {name!r} {how} for {count} samples from {at:.6g} s on{more}: lost data?"
         f" {after}",
+    )
+
+
+def burst_remarks(records: Sequence[Record], residuals: Sequence[Floats], noise: Floats) -> tuple[str, ...]:
+    """A remark on each record whose outputs lost samples, or most of whose residual lies within a short part.
+
+    Where samples are lost, the state of the structure jumps, and the residual decays as its modes do. The residual of a
+    nonlinear structure grows with its motion, up to the cube; that is no burst. Residuals (n_samples, n_outputs) are
+    aligned with the last samples of each record, and have standard deviations `noise` (n_outputs,).
+    """
+    remarks: list[str] = []
+    for record, residual in zip(records, residuals, strict=True):
+        lost = dropout_remark(record, "Modes and changes are wrong by it; leave it out, or cut the record")
+        remarks += lost or _burst(record, residual, noise)
+    return tuple(remarks)
+
+
+def _burst(record: Record, residual: Floats, noise: Floats) -> tuple[str, ...]:
+    motion = record.outputs[:, -len(residual) :].T
+    noise_free = noise < DATA.noise_free * motion.std(axis=0)
+    if len(residual) < DATA.parts * DATA.samples or noise_free.all():
+        return ()
+    residual = residual / noise
+    motion = (motion - motion.mean(axis=0)) / np.maximum(motion.std(axis=0), 1e-300)
+    shares, moving = (np.array([np.vdot(p, p) for p in np.array_split(x, DATA.parts)]) for x in (residual, motion))
+    together = np.ones(DATA.together)
+    # noise in proportion to the motion, and cubic distortion
+    expected = [np.convolve(moving**k / max((moving**k).sum(), 1e-300), together, "valid") for k in (1, 3)]
+    shares = np.convolve(shares / max(shares.sum(), 1e-300), together, "valid")
+    first = int(np.argmax(shares))
+    least = max(DATA.share, DATA.times * max(each[first] for each in expected))
+    if shares[first] < least or expected[0].max() > DATA.share:  # after an impact the motion itself is a burst
+        return ()
+    edges = np.array_split(record.time[-len(residual) :], DATA.parts)
+    begins, ends = edges[first][0], edges[first + DATA.together - 1][-1]
+    return (
+        f"in record {record.name!r} {100 * shares[first]:.0f} % of the residual energy lies from {begins:.4g} to"
+        f" {ends:.4g} s: lost or wrong samples, or an unmeasured impact? It may look like noise of the inputs, or like"
+        " modes that change; leave that part out",
     )
 
 

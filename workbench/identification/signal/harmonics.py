@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from workbench.arrays import Complexes, Floats
+from workbench.identification.signal.modal_estimates import SURE
 from workbench.records.record import Record
 from workbench.structure.printed import mode_text
 
@@ -32,7 +33,6 @@ class HarmonicSettings:
     at_most: float = 0.03  # largest amplitude of an overtone, relative to its base
     within: float = 2e-3  # relative tolerance of its frequency
     scatters: float = 2.0  # further tolerance of its frequency, in rms scatters of the base's frequency times the order
-    sure: float = 3.0  # further tolerance of frequency and decay rate, in standard errors
     damping: float = 0.2  # relative tolerance of its decay rate
 
 
@@ -159,6 +159,6 @@ def _sums(poles: np.ndarray, size: Floats, base: int, r: int) -> Iterator[tuple[
 
 def _agrees(pole: complex, overtone: complex, scatter: float, deviation: complex) -> bool:
     """Whether a pole agrees with that of an overtone in frequency and in decay rate."""
-    frequency = HARMONICS.within * overtone.imag + HARMONICS.scatters * scatter + HARMONICS.sure * deviation.imag
-    decay = HARMONICS.damping * abs(overtone.real) + HARMONICS.sure * deviation.real
+    frequency = HARMONICS.within * overtone.imag + HARMONICS.scatters * scatter + SURE * deviation.imag
+    decay = HARMONICS.damping * abs(overtone.real) + SURE * deviation.real
     return abs(pole.imag - overtone.imag) < frequency and abs(pole.real - overtone.real) < decay

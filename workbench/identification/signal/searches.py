@@ -58,6 +58,7 @@ class SelectionSettings:
     same_shape: float = 0.95  # MAC from which on two overlapping poles are one mode, split
     most_rounds: int = 4  # in coloured noise, or with amplitude dependence, modes might enter and leave for ever
     few_steps: int = 12  # of a fit that only decides whether a mode enters or leaves
+    decided: float = 0.1  # decrease of χ², expected of a further step per value, below which such a fit ends
     weak: float = 4.0  # times the threshold, below which a mode may be noise and is tested again
     close: float = 2.0  # bandwidths to the next mode, likewise
     noise_bins: int = 50  # on either side of a pole, from which the noise about it is estimated
@@ -160,19 +161,15 @@ class LeastSquares(Protocol[State]):
 
     def cost(self, state: State) -> float:
         """The function that is minimised; infinite where the state is not admissible."""
-        ...
 
     def normal_equations(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """N (n_unknowns, n_unknowns), half the Hessian or near it, and g (n_unknowns,), half the negative gradient."""
-        ...
 
     def moved(self, state: State, step: np.ndarray) -> tuple[State | None, np.ndarray]:
         """The state after a step, None where it is not admissible, and the part of the step that was taken."""
-        ...
 
     def negligible(self, decrease: float, cost: float) -> bool:
         """Whether a step of this predicted decrease of the cost may be the last."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,62 +256,42 @@ class Selection(Protocol[Model, Candidate]):
 
     def strongest(self, model: Model, rejected: list[tuple[complex, float]]) -> Candidate | None:
         """The candidate most likely to be a further mode; None where the residual of the model is noise."""
-        ...
 
     def pole_of(self, candidate: Candidate) -> complex: ...
 
     def extended(self, model: Model, candidate: Candidate) -> Model:
         """The model with one more mode, all fitted again; LinAlgError where they cannot be distinguished."""
-        ...
 
     def gain(self, smaller: Model, larger: Model) -> float:
         """Twice the log-likelihood ratio of two models."""
-        ...
 
     def threshold(self, model: Model, pole: complex) -> float:
         """The gain by a mode at this pole that noise exceeds with the probability of a false alarm."""
-        ...
 
     def splits(self, model: Model, trial: Model) -> bool:
         """Whether the mode that a trial adds splits a mode of the model in two, or is spurious."""
-        ...
 
     def settled(self, model: Model) -> Model:
         """The model fitted to convergence."""
-        ...
 
     def suspects(self, model: Model) -> Iterable[tuple[complex, Model, bool]]:
         """Modes to test: the pole of each, the model without it, and whether it is certainly spurious."""
-        ...
 
 
 @dataclass
 class OrderSelection(Generic[Model, Candidate]):
-    """Stepwise selection of modes, forward and backward.
+    """Stepwise selection of modes, forward and backward."""
 
-    Attributes:
-        problem: see `Selection`.
-        max_modes: largest number of modes.
-        most_weak: number of consecutive candidates below the threshold at which the forward search ends.
-        most_splits: number of candidates that split a mode at which it ends; None to count these as weak.
-        forgets: whether a rejected candidate may be tried again once another mode has entered.
-        time_limit: of processor time.
-        alone: whether the whole time is for this selection.
-        rejected: poles tried and rejected, with their gain.
-        full: whether the selection stopped at `max_modes`.
-        cut_short: whether the time limit ended the last forward search.
-    """
-
-    problem: Selection[Model, Candidate]
-    max_modes: float
-    most_weak: float
-    most_splits: int | None
-    forgets: bool
-    time_limit: TimeLimit = field(default_factory=TimeLimit)
-    alone: bool = False
-    rejected: list[tuple[complex, float]] = field(default_factory=list)
-    full: bool = False
-    cut_short: bool = False
+    problem: Selection[Model, Candidate]  # see `Selection`
+    max_modes: float  # largest number of modes
+    most_weak: float  # number of consecutive candidates below the threshold at which the forward search ends
+    most_splits: int | None  # number of candidates that split a mode at which it ends; None to count these as weak
+    forgets: bool  # whether a rejected candidate may be tried again once another mode has entered
+    time_limit: TimeLimit = field(default_factory=TimeLimit)  # of processor time
+    alone: bool = False  # whether the whole time is for this selection
+    rejected: list[tuple[complex, float]] = field(default_factory=list)  # poles tried and rejected, with their gain
+    full: bool = False  # whether the selection stopped at `max_modes`
+    cut_short: bool = False  # whether the time limit ended the last forward search
 
     def select(self, model: Model) -> Model:
         """The model after forward and backward selection, starting from `model`."""
