@@ -307,6 +307,6 @@ def hold_remarks(data: KnownInputs, fit: Fit, threshold: float, time_limit: Time
     if best == data.hold or costs[best] > data.cost(fit) - threshold:
         return ()
     return (
-        f"the records show inputs {HOLD_IN_WORDS[best]}, not {HOLD_IN_WORDS[data.hold]} as input_hold={data.hold!r} says:"
-        f" residues and modal masses are wrong, the more the higher the mode; give input_hold={best!r}",
+        f"the records show inputs {HOLD_IN_WORDS[best]}, not {HOLD_IN_WORDS[data.hold]} as input_hold={data.hold!r}"
+        f" says: residues and modal masses are wrong, the more the higher the mode; give input_hold={best!r}",
     )
