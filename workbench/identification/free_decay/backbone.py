@@ -26,7 +26,7 @@ from scipy.fft import fft, rfft
 
 from workbench.arrays import Complexes, Floats
 from workbench.identification.signal.projection import project
-from workbench.identification.signal.searches import FIT, CachedResidual
+from workbench.identification.signal.searches import FIT, CachedResidual, diverged, projected_residual
 from workbench.records.record import Record
 
 
@@ -44,7 +44,6 @@ class BackboneSettings:
     samples_each: int = 20  # least number of samples per mode that remain
     slightly: float = 1e-5  # step of finite differences, relative to the decay rate
     largest: float = 1e100  # limit above which a motion diverges
-    diverged: float = 10.0  # residual of a diverging motion, over the record
     lines: float = 10.0  # half width of the band of comparison beyond the two modes, in lines
     bandwidths: float = 4.0  # and in addition to that, in half bandwidths
     smooth: int = 4  # coefficients of the polynomial for modes outside the band
@@ -162,14 +161,16 @@ class _Band:
         `which` (n_unknowns,) by each unknown.
         """
         if not (np.abs(slopes) < BACKBONE.largest).all():
-            return BACKBONE.diverged * np.abs(self.y), np.zeros((self.y.size, len(slopes)))
+            return diverged(self.y, len(slopes))
         real, imaginary = self.lines_of(np.vstack([motions, slopes]))
         p = len(motions)
-        q, r = np.linalg.qr(self.without_others(np.hstack([real[:, :p], imaginary[:, :p]])))
-        along = q.T @ self.y
-        a, b = np.linalg.lstsq(r, along, rcond=1e-12)[0].reshape(2, p)[:, list(which)]
-        columns = self.without_others(real[:, p:] * a + imaginary[:, p:] * b)
-        return self.y - q @ along, -(columns - q @ (q.T @ columns))
+
+        def tangents_of(coefficients: Floats) -> Floats:
+            a, b = coefficients.reshape(2, p)[:, list(which)]
+            return self.without_others(real[:, p:] * a + imaginary[:, p:] * b)
+
+        columns = self.without_others(np.hstack([real[:, :p], imaginary[:, :p]]))
+        return projected_residual(self.y, columns, tangents_of)
 
 
 def _modes_misfit(bands: Sequence[_Band], poles: Complexes) -> Floats:

@@ -29,7 +29,7 @@ from workbench.structure.modes import frozen
 
 @dataclass(frozen=True)
 class StartSettings:
-    """Constants of the detection of a decay's start, of spikes, and of exponential settling."""
+    """Constants of the test for a free decay, of the detection of its start, of spikes, and of exponential settling."""
 
     order: int = 32  # of the backward predictor
     block: int = 4  # samples per update of the predictor
@@ -54,12 +54,6 @@ class StartSettings:
     neighbours: int = 8  # on either side, from which a spike is interpolated
     about: int = 200  # samples on either side, from which the interpolation is estimated
     leaps: float = 6.0  # interpolation error of a spike, in standard deviations
-
-
-@dataclass(frozen=True)
-class DecayingSettings:
-    """Constants of the test for a free decay."""
-
     decayed: float = 0.1  # rms of the last tenth over the largest of any tenth, below which a record has decayed
     falling: int = 6  # tenths of decreasing level: by chance in 1 of 720 stationary records
     # Share of the energy that decaying modes leave of a short free decay, at most: 0.05 where noise is a tenth of the
@@ -71,7 +65,7 @@ class DecayingSettings:
     signals: int = 8  # of that fit, evenly spaced among the outputs
 
 
-START, DECAYING = StartSettings(), DecayingSettings()
+START = StartSettings()
 HIGHEST_DEGREE = 8  # of a drift; polynomials of higher degree oscillate like modes
 PART = 16_384  # most samples of a part of a record in the fit of drifts
 # Least number of samples to estimate the predictor and to test it.
@@ -127,16 +121,16 @@ def decays(record: Record) -> bool:
     about = record.outputs - record.outputs[:, -max(record.n_samples // 10, 1) :].mean(axis=1, keepdims=True)
     tenths = [float((part**2).mean()) for part in np.array_split(about, 10, axis=1) if part.size]
     falling = tenths[int(np.argmax(tenths)) :]
-    is_at_rest = tenths[-1] < DECAYING.decayed**2 * max(tenths)
-    falls = len(falling) >= DECAYING.falling and (np.diff(falling) < 0).all()
+    is_at_rest = tenths[-1] < START.decayed**2 * max(tenths)
+    falls = len(falling) >= START.falling and (np.diff(falling) < 0).all()
     return bool(is_at_rest or falls or _explained(record))
 
 
 def _explained(record: Record) -> bool:
     """Whether the record falls from the start of a decay on, and decaying modes leave little of it."""
     after = record.between(decay_start(record))
-    stride = -(-after.n_samples // DECAYING.instants)
-    sensors = slice(None, None, -(-after.n_outputs // DECAYING.signals))
+    stride = -(-after.n_samples // START.instants)
+    sensors = slice(None, None, -(-after.n_outputs // START.signals))
     outputs = after.outputs[sensors, ::stride]
     outputs = outputs - outputs.mean(axis=1, keepdims=True)
     energy = [float((part**2).sum()) for part in np.array_split(outputs, 2, axis=1)]
@@ -144,11 +138,11 @@ def _explained(record: Record) -> bool:
         return False
     part = Record(stride * after.sample_time, outputs, after.output_channels[sensors])
     try:
-        poles = stacked_delays(part, n_modes=DECAYING.modes).poles
+        poles = stacked_delays(part, n_modes=START.modes).poles
     except ValueError:  # too short
         return False
     left = project(part, poles[poles.real < 0], True).residual
-    return float((left**2).sum()) < DECAYING.left * float((outputs**2).sum())
+    return float((left**2).sum()) < START.left * float((outputs**2).sum())
 
 
 def without_spikes(record: Record) -> tuple[Record, float, tuple[str, ...]]:

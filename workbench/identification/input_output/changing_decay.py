@@ -25,13 +25,11 @@ from workbench.identification.input_output.competing_models import (
     COMPETING,
     bases_with_changes,
     beyond_linear,
-    diverged,
     in_place_of_clusters,
-    projected_residual,
 )
 from workbench.identification.input_output.modal_fit import Fit, regressors, row_weights
 from workbench.identification.input_output.spectral_lines import Lines, rows_of_pair
-from workbench.identification.signal.searches import CachedResidual, TimeLimit
+from workbench.identification.signal.searches import CachedResidual, TimeLimit, diverged, projected_residual
 from workbench.structure.modes import mac
 
 
@@ -224,9 +222,15 @@ class _Peak:
     def _residual(self, motions: np.ndarray) -> tuple[Floats, Floats]:
         """Residual (n,) and its Jacobian (n, n_unknowns)."""
         if not (np.abs(motions) < DECAY.largest).all():
-            return diverged(self.values, motions.shape[1] - 1)
-        rows = np.hstack(self.decays.rows(motions))
-        return projected_residual(self.values, self._beyond_others([weight * rows for weight in self.weights]))
+            return diverged(np.concatenate(self.values), motions.shape[1] - 1)
+        rows, n = np.hstack(self.decays.rows(motions)), motions.shape[1]
+
+        def of_output(y: Floats, x: Floats) -> tuple[Floats, Floats]:
+            return projected_residual(y, x[:, [0, n]], lambda c: c[0] * x[:, 1:n] + c[1] * x[:, n + 1 :])
+
+        beyond = self._beyond_others([weight * rows for weight in self.weights])
+        residuals, jacobians = zip(*map(of_output, self.values, beyond), strict=True)
+        return np.concatenate(residuals), np.vstack(jacobians)
 
     def _beyond_others(self, outputs: Iterable[Floats]) -> list[Floats]:
         """What the other modes do not explain of each output, (n_rows,) or (n_rows, k), in units of its noise."""

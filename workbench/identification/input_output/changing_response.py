@@ -17,16 +17,11 @@ from numba import njit
 from scipy.optimize import least_squares
 
 from workbench.arrays import Floats
-from workbench.identification.input_output.competing_models import (
-    COMPETING,
-    bases_with_changes,
-    beyond_linear,
-    diverged,
-)
+from workbench.identification.input_output.competing_models import COMPETING, bases_with_changes, beyond_linear
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit
 from workbench.identification.input_output.noise_spectrum import lines_of
-from workbench.identification.signal.searches import TimeLimit
+from workbench.identification.signal.searches import TimeLimit, diverged, projected_residual
 
 
 @dataclass(frozen=True)
@@ -402,14 +397,16 @@ class _Response:
         that of Kaufman (1975)."""
         motions = self._motions(unknowns, law, slopes)
         if not all(np.isfinite(z[-1]).all() for z in motions):
-            return diverged([self.values], unknowns.size)
-        q, r = np.linalg.qr(self._beyond_others([np.column_stack([z[:, 0].real, z[:, 0].imag]) for z in motions]))
-        in_motion = q.T @ self.values
-        a, b = np.linalg.lstsq(r, in_motion, rcond=1e-12)[0]
-        tangents = np.zeros((self.values.size, 0))
-        if slopes:
-            tangents = self._beyond_others([a * z[:, 1:].real + b * z[:, 1:].imag for z in motions])
-        return np.asarray(self.values - q @ in_motion), np.asarray(q @ (q.T @ tangents) - tangents)
+            return diverged(self.values, unknowns.size)
+
+        def tangents_of(coefficients: Floats) -> Floats:
+            if not slopes:
+                return np.zeros((self.values.size, 0))
+            a, b = coefficients
+            return self._beyond_others([a * z[:, 1:].real + b * z[:, 1:].imag for z in motions])
+
+        columns = self._beyond_others([np.column_stack([z[:, 0].real, z[:, 0].imag]) for z in motions])
+        return projected_residual(self.values, columns, tangents_of)
 
     def _beyond_others(self, samples: Sequence[Floats]) -> Floats:
         """What the other modes do not explain of columns (n_samples, k) of each record, in the lines that count."""

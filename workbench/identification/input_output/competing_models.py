@@ -18,7 +18,6 @@ from workbench.identification.input_output.modal_fit import (
     MANY_ROWS,
     Fit,
     Measurement,
-    Pair,
     changes_of,
     combinations,
     modal_coordinate,
@@ -147,30 +146,6 @@ def bases_with_changes(
         each = weight * np.hstack([phi, changes_of(a, (real[:, ::step], imaginary[:, ::step]))])
         bases.append(orthonormal_basis(normalised_columns(each), COMPETING.collinear))
     return bases
-
-
-def projected_residual(values: Sequence[Floats], motions: Sequence[Floats]) -> Pair:
-    """Residual of all outputs (n_lines,) with the shape of a motion projected out, and its Jacobian (Kaufman 1975).
-
-    Motions of each output are (n_lines, 2 (1 + n_unknowns)), real parts of the motion and of its slopes by the
-    unknowns, then imaginary ones.
-    """
-    residuals, jacobians = [], []
-    for y, x in zip(values, motions, strict=True):
-        n = x.shape[1] // 2
-        q, r = np.linalg.qr(x[:, [0, n]])
-        in_motion = q.T @ y
-        a, b = np.linalg.lstsq(r, in_motion, rcond=1e-12)[0]
-        tangents = a * x[:, 1:n] + b * x[:, n + 1 :]
-        residuals.append(y - q @ in_motion)
-        jacobians.append(q @ (q.T @ tangents) - tangents)
-    return np.concatenate(residuals), np.vstack(jacobians)
-
-
-def diverged(values: Sequence[Floats], n_unknowns: int) -> Pair:
-    """In place of `projected_residual` where the motion diverges: a large residual that no unknown changes."""
-    residual = 10.0 * np.abs(np.concatenate(values))
-    return residual, np.zeros((residual.size, n_unknowns))
 
 
 def _nearest_pole(data: Measurement, motion: np.ndarray, pole: complex, l_r: np.ndarray) -> complex:

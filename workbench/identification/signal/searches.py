@@ -245,6 +245,24 @@ class CachedResidual:
         return np.asarray(least_squares(residual, start, jacobian, x_scale="jac", max_nfev=most_tries, **options).x)
 
 
+def projected_residual(
+    values: Floats, columns: Floats, tangents_of: Callable[[Floats], Floats]
+) -> tuple[Floats, Floats]:
+    """Residual of values (n,) with columns (n, k) projected out, and its Jacobian (n, n_unknowns) (Kaufman 1975).
+
+    `tangents_of` gives the changes of the columns with the unknowns, times given coefficients (k,) of the columns.
+    """
+    q, r = np.linalg.qr(columns)
+    along = q.T @ values
+    tangents = tangents_of(np.linalg.lstsq(r, along, rcond=1e-12)[0])
+    return np.asarray(values - q @ along), np.asarray(q @ (q.T @ tangents) - tangents)
+
+
+def diverged(values: Floats, n_unknowns: int) -> tuple[Floats, Floats]:
+    """In place of `projected_residual` where a motion diverges: a large residual that no unknown changes."""
+    return 10.0 * np.abs(values), np.zeros((values.size, n_unknowns))
+
+
 Model = TypeVar("Model")
 Candidate = TypeVar("Candidate")
 
