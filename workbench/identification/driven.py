@@ -17,12 +17,15 @@ from scipy.stats import chi2
 from workbench.arrays import Floats
 from workbench.identification.input_output.after_impacts import after_impacts
 from workbench.identification.input_output.changing_response import CHANGE_CHECK
-from workbench.identification.input_output.excitation import check_inputs, unexcited_remarks
+from workbench.identification.input_output.excitation import (
+    begin_at_rest,
+    check_inputs,
+    force_window,
+    unexcited_remarks,
+)
 from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, vector_covariance
-from workbench.identification.input_output.force_window import force_window
 from workbench.identification.input_output.held_out import left_about, unpredictive_remarks
-from workbench.identification.input_output.input_delays import delay_remarks, select_with_delays
-from workbench.identification.input_output.input_holds import hold_remarks
+from workbench.identification.input_output.input_delays import delay_remarks, hold_remarks, select_with_delays
 from workbench.identification.input_output.input_noise import (
     noise_levels,
     noise_outside_impacts,
@@ -43,12 +46,14 @@ from workbench.identification.input_output.modal_fit import (
 from workbench.identification.input_output.model_order import SelectedModes, SelectionOptions
 from workbench.identification.input_output.output_clock import clock_remarks, on_inputs_clock
 from workbench.identification.input_output.peak_shape import overlap_remarks
-from workbench.identification.input_output.quiet_start import begin_at_rest
-from workbench.identification.input_output.residual_bursts import burst_remarks
-from workbench.identification.input_output.selection import only_predictive, reweighted, select
-from workbench.identification.input_output.sensor_drift import beside_drift
+from workbench.identification.input_output.selection import beside_drift, only_predictive, reweighted, select
 from workbench.identification.input_output.time_variance import change_remarks, joined
-from workbench.identification.signal.data_quality import check_outputs_move, input_faults, of_same_sensors
+from workbench.identification.signal.data_quality import (
+    burst_remarks,
+    check_outputs_move,
+    input_faults,
+    of_same_sensors,
+)
 from workbench.identification.signal.harmonics import harmonic_remarks
 from workbench.identification.signal.modal_estimates import SURE, ParticipatingModes, credible, time_derivatives
 from workbench.identification.signal.projection import correlation, disturbed

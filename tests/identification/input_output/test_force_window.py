@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import chirp, lfilter
 
 from workbench.identification.driven import identify_driven
-from workbench.identification.input_output.force_window import force_window
+from workbench.identification.input_output.excitation import force_window
 from workbench.records.record import Channel, Record
 
 DT, N = 1e-3, 12_000

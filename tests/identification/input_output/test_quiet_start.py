@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from workbench.identification.driven import identify_driven
-from workbench.identification.input_output.quiet_start import begin_at_rest
+from workbench.identification.input_output.excitation import begin_at_rest
 from workbench.records.record import Channel, Record
 
 

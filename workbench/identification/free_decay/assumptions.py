@@ -113,12 +113,8 @@ def amplitude_dependence(
     values = [_segments(record, refined, np.abs(a), noise, segments, time_limit) for record, a, noise in each]
     start = np.concatenate([each[0] for each in values])
     amplitude, omega, omega_std, zeta, zeta_std = (frozen(rows) for rows in np.hstack([each[1] for each in values]))
-    probability = np.stack(
-        [
-            _equality(omega, np.hypot(omega_std, ASSUMPTIONS.resolution[0] * omega)),
-            _equality(zeta, np.hypot(zeta_std, ASSUMPTIONS.resolution[1] * zeta)),
-        ]
-    )
+    both = zip((omega, zeta), (omega_std, zeta_std), ASSUMPTIONS.resolution, strict=True)
+    probability = np.stack([_equality(value, np.hypot(std, resolution * value)) for value, std, resolution in both])
     which = np.repeat(np.arange(len(records)), segments)
     return AmplitudeDependence(
         frozen(which, int), frozen(start), amplitude, omega, omega_std, zeta, zeta_std, frozen(probability)
@@ -158,9 +154,8 @@ def _segments(
         if time_limit.spent("comparison of modes by amplitude"):
             break
         try:
-            refitted = in_coloured_noise(
-                refine(segment, modes.select(list(significant)), offset=True, time_limit=time_limit), segment
-            )
+            refitted = refine(segment, modes.select(list(significant)), offset=True, time_limit=time_limit)
+            refitted = in_coloured_noise(refitted, segment)
         except np.linalg.LinAlgError:
             continue
         if not refitted.converged:
@@ -183,9 +178,7 @@ def _segments(
 def _equality(values: np.ndarray, std: np.ndarray) -> np.ndarray:
     """Probability of a scatter of values as large as in each column, (n_modes,), if only their errors differ.
 
-    Args:
-        values: (n_segments, n_modes), nan where unknown.
-        std: (n_segments, n_modes) standard errors.
+    Values and their standard errors are (n_segments, n_modes), nan where unknown.
     """
     weights = np.where(np.isfinite(values), 1.0 / std**2, 0.0)
     known = np.where(np.isfinite(values), values, 0.0)

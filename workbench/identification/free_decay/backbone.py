@@ -26,7 +26,7 @@ from scipy.fft import fft, rfft
 
 from workbench.arrays import Complexes, Floats
 from workbench.identification.signal.projection import project
-from workbench.identification.signal.searches import FIT, CachedResidual
+from workbench.identification.signal.searches import FIT, CachedResidual, diverged, projected_residual
 from workbench.records.record import Record
 
 
@@ -44,7 +44,6 @@ class BackboneSettings:
     samples_each: int = 20  # least number of samples per mode that remain
     slightly: float = 1e-5  # step of finite differences, relative to the decay rate
     largest: float = 1e100  # limit above which a motion diverges
-    diverged: float = 10.0  # residual of a diverging motion, over the record
     lines: float = 10.0  # half width of the band of comparison beyond the two modes, in lines
     bandwidths: float = 4.0  # and in addition to that, in half bandwidths
     smooth: int = 4  # coefficients of the polynomial for modes outside the band
@@ -58,12 +57,10 @@ POWERS = ((0.0, 1.0, 2.0), (0.0, 0.5, 1.0), (0.0, -1.0, 1.0))
 
 
 def are_two(records: Sequence[Record], poles: Complexes, r: int, s: int, threshold: float) -> bool:
-    """Whether two linear modes r and s are likelier than one amplitude-dependent mode.
+    """Whether two linear modes r and s are likelier than one amplitude-dependent mode, in free decays of one output.
 
     Args:
-        records: free decay, of one output.
         poles: (n_modes,) of a fit with both, rad/s.
-        r, s: indices of the modes.
         threshold: of twice the log-likelihood ratio, between models of equally many parameters.
     """
     pair, others = poles[[r, s]], np.delete(poles, [r, s])
@@ -113,8 +110,12 @@ class _Band:
     """
 
     def __init__(self, record: Record, pair: Complexes, others: Complexes) -> None:
-        record = while_it_lasts(record, pair, pair.size + others.size)
         dt = record.sample_time
+        # The record is cut to where the two modes have decayed.
+        last = BACKBONE.lasts / max(float(-pair.real.max()) * dt, 1e-300)
+        last = int(max(last, BACKBONE.samples_each * (pair.size + others.size)))
+        if last < record.n_samples - 1:
+            record = record.between(record.start_time, record.start_time + last * dt)
         half = band_about(pair, 2.0 * np.pi / (record.n_samples * dt))[1]
         self.step = max(int(min(record.n_samples / BACKBONE.few, BACKBONE.turns / (half * dt))), 1)
         if half > BACKBONE.narrow * float(pair.imag.min()):
@@ -156,33 +157,20 @@ class _Band:
     def residual(self, motions: Complexes, slopes: Complexes, which: Sequence[int]) -> tuple[Floats, Floats]:
         """Residual (2 n_lines,) of a fit of motions, with A eliminated (Kaufman 1975), and its Jacobian.
 
-        Args:
-            motions: (n_motions, n_times) complex, of free amplitudes A.
-            slopes: (n_unknowns, n_times) derivatives of the motions by each unknown.
-            which: index of the motion of each unknown.
+        From motions (n_motions, n_times) of free amplitudes A, and the derivatives (n_unknowns, n_times) of the motions
+        `which` (n_unknowns,) by each unknown.
         """
         if not (np.abs(slopes) < BACKBONE.largest).all():
-            return BACKBONE.diverged * np.abs(self.y), np.zeros((self.y.size, len(slopes)))
+            return diverged(self.y, len(slopes))
         real, imaginary = self.lines_of(np.vstack([motions, slopes]))
         p = len(motions)
-        q, r = np.linalg.qr(self.without_others(np.hstack([real[:, :p], imaginary[:, :p]])))
-        along = q.T @ self.y
-        a, b = np.linalg.lstsq(r, along, rcond=1e-12)[0].reshape(2, p)[:, list(which)]
-        columns = self.without_others(real[:, p:] * a + imaginary[:, p:] * b)
-        return self.y - q @ along, -(columns - q @ (q.T @ columns))
 
+        def tangents_of(coefficients: Floats) -> Floats:
+            a, b = coefficients.reshape(2, p)[:, list(which)]
+            return self.without_others(real[:, p:] * a + imaginary[:, p:] * b)
 
-def while_it_lasts(record: Record, pair: np.ndarray, n_modes: int) -> Record:
-    """A free decay cut to where two of its modes, poles `pair` in rad/s, have decayed."""
-    last = BACKBONE.lasts / max(float(-pair.real.max()) * record.sample_time, 1e-300)
-    last = max(last, BACKBONE.samples_each * n_modes)
-    if last >= record.n_samples - 1:
-        return record
-    return record.between(record.start_time, record.start_time + int(last) * record.sample_time)
-
-
-def _least_squares(once: CachedResidual, start: Floats, most_tries: int = BACKBONE.most_tries) -> Floats:
-    return once.least(start, most_tries, ftol=BACKBONE.settled)
+        columns = self.without_others(np.hstack([real[:, :p], imaginary[:, :p]]))
+        return projected_residual(self.y, columns, tangents_of)
 
 
 def _modes_misfit(bands: Sequence[_Band], poles: Complexes) -> Floats:
@@ -210,41 +198,36 @@ def _modes_misfit(bands: Sequence[_Band], poles: Complexes) -> Floats:
     start = np.r_[poles.real, poles.imag]
     if len(bands) > 1:
         weights = np.sqrt([band.size for band in bands] / (squares(start) + [band.round_off for band in bands]))
-    return squares(_least_squares(CachedResidual(weighted), start))
+    return squares(CachedResidual(weighted).least(start, BACKBONE.most_tries, ftol=BACKBONE.settled))
 
 
 def backbone_misfit(band: _Band, pair: Complexes, *, enough: float = 0.0) -> float:
-    """Least residual sum of squares of one mode on a backbone, in place of two linear modes.
+    """Least residual sum of squares of one mode on a backbone, in place of two linear modes of poles `pair`, rad/s.
 
-    Args:
-        band: about the two modes.
-        pair: (2,) their poles, rad/s.
-        enough: sum of squares at which the search ends.
+    The search ends at the sum of squares `enough`.
     """
     tried: list[tuple[float, _Backbone, Floats]] = []
     for powers in POWERS:
         model = _Backbone(band, np.array(powers))
         for start in model.starts(pair):
-            at = _least_squares(model.once, start, BACKBONE.first_tries)
+            at = model.once.least(start, BACKBONE.first_tries, ftol=BACKBONE.settled)
             tried.append((float((model.once(at)[0] ** 2).sum()), model, at))
             if tried[-1][0] <= enough:
                 return tried[-1][0]
     _, model, at = min(tried, key=lambda each: each[0])
-    return float((model.once(_least_squares(model.once, at))[0] ** 2).sum())
+    at = model.once.least(at, BACKBONE.most_tries, ftol=BACKBONE.settled)
+    return float((model.once(at)[0] ** 2).sum())
 
 
 def common_backbone_misfit(bands: Sequence[_Band], weights: Floats, pair: Complexes) -> Floats:
     """Residual sum of squares of each record, (n_records,), of one mode on a backbone common to all records.
 
-    Args:
-        bands: one per record.
-        weights: (n_records,) 1 / noise.
-        pair: (2,) poles of the two linear modes, rad/s.
+    In place of two linear modes of poles `pair`, rad/s; weights (n_records,) are 1 / noise.
     """
     models = [_Common([_Backbone(band, np.array(powers)) for band in bands], weights) for powers in POWERS]
-    first = [_least_squares(model.once, model.start(pair), BACKBONE.first_tries) for model in models]
+    first = [model.once.least(model.start(pair), BACKBONE.first_tries, ftol=BACKBONE.settled) for model in models]
     best = int(np.argmin([(model.once(at)[0] ** 2).sum() for model, at in zip(models, first, strict=True)]))
-    return models[best].squares(_least_squares(models[best].once, first[best]))
+    return models[best].squares(models[best].once.least(first[best], BACKBONE.most_tries, ftol=BACKBONE.settled))
 
 
 @njit(cache=True, nogil=True)

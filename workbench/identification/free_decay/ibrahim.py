@@ -108,11 +108,7 @@ def stacked_delays(
 
 
 def signal_subspace(records: Sequence[Record], order: int, *, delays: int | None = None) -> np.ndarray:
-    """Leading left singular vectors of the block Hankel matrix, (n_outputs * delays, order).
-
-    Raises:
-        ValueError: fewer samples than the order needs.
-    """
+    """Leading left singular vectors of the block Hankel matrix, (n_outputs * delays, order)."""
     m, shortest = records[0].n_outputs, min(records, key=lambda record: record.n_samples)
     if delays is None:
         # a third of the shortest record, fewer where the matrix would be too large
@@ -147,12 +143,11 @@ def _modes_of(basis: np.ndarray, record: Record, branch: int = 0) -> SampledMode
 
 def as_modes(mu: np.ndarray, vectors: np.ndarray, record: Record, branch: int = 0) -> SampledModes:
     """Modes from eigenvalues μ of one step in time, λ = (log μ + 2πi k)/Δt (3.23); real eigenvalues are left out."""
-    upper = (mu.imag > 0) & (np.abs(mu) > 0)
-    # On every second branch above Nyquist aliasing mirrors the spectrum: the conjugate eigenvalue is observed.
-    observed = mu[upper] if branch % 2 == 0 else mu[upper].conj()
-    vectors = vectors[:, upper] if branch % 2 == 0 else vectors[:, upper].conj()
+    mu, vectors = mu[mu.imag > 0], vectors[:, mu.imag > 0]
+    if branch % 2:  # above Nyquist aliasing mirrors every second branch: the conjugate eigenvalue is observed
+        mu, vectors = mu.conj(), vectors.conj()
     turns = (branch + 1) // 2
-    poles = (np.log(observed) + 2j * np.pi * turns) / record.sample_time
+    poles = (np.log(mu) + 2j * np.pi * turns) / record.sample_time
     order = np.argsort(np.abs(poles))
     shapes = normalised_shapes(vectors / poles ** time_derivatives(record.output_channels)[:, None])
     return SampledModes.of_poles(poles[order], shapes[:, order], record.positions)
@@ -160,12 +155,7 @@ def as_modes(mu: np.ndarray, vectors: np.ndarray, record: Record, branch: int = 
 
 @dataclass(frozen=True, eq=False)
 class Stabilisation:
-    """The modes identified at each model order, from the lowest to the highest.
-
-    Attributes:
-        orders: numbers of modes.
-        found: the `SampledModes` of each order.
-    """
+    """The modes `found` at each of some numbers of modes, `orders`, from the lowest to the highest."""
 
     orders: tuple[int, ...]
     found: tuple[SampledModes, ...]
@@ -173,12 +163,8 @@ class Stabilisation:
 
 @dataclass(frozen=True, eq=False)
 class StableModes:
-    """The stable modes of a diagram.
-
-    Attributes:
-        modes: each from the order at which its phase collinearity is highest.
-        presence: (n_modes,) share of the orders at which each was found.
-    """
+    """The stable modes of a diagram, each from the order at which its phase collinearity is highest, and the share of
+    the orders, (n_modes,), at which each was found."""
 
     modes: SampledModes
     presence: np.ndarray
@@ -212,11 +198,8 @@ def stable_modes(diagram: Stabilisation, *, min_phase_collinearity: float = 0.8)
     """
     groups: list[list[tuple[SampledModes, int]]] = []
     for modes in diagram.found:
-        keep = (
-            (modes.zeta > 0)
-            & (modes.zeta < STABILITY.most_damped)
-            & (modes.phase_collinearity >= min_phase_collinearity)
-        )
+        is_mode = (modes.zeta > 0) & (modes.zeta < STABILITY.most_damped)
+        keep = is_mode & (modes.phase_collinearity >= min_phase_collinearity)
         taken = set()
         # The most collinear shapes are assigned first: a mode precedes poles that split off it.
         for r in sorted(np.flatnonzero(keep).tolist(), key=lambda r: -modes.phase_collinearity[r]):

@@ -68,14 +68,7 @@ LONG = LongSettings()
 def identify_long(
     records: Sequence[Record], *, max_modes: int, false_alarm: float = FALSE_ALARM, time_limit: TimeLimit | None = None
 ) -> IdentifiedModes | None:
-    """The modes of long records, their number selected; None where none is significant.
-
-    Args:
-        records: free decay in white noise, of the same sensors at one rate; each output may hold a constant.
-        max_modes: largest number of modes.
-        false_alarm: probability that noise alone is taken for a mode.
-        time_limit: of processor time; none unless given.
-    """
+    """The modes of long records, as of `identify`, their number selected; None where none is significant."""
     measured = _Search(records, false_alarm, time_limit or TimeLimit())
     measured.run(max_modes)
     uncorrelated = independent(records, [fit.residual.T for fit in measured.fits]) if measured.poles.size else None
@@ -95,9 +88,7 @@ class _Search:
     """The state of the search: current poles, their fit and residual, and rejected candidates.
 
     Attributes:
-        rates: decay rates of the search, 1/s.
-        enter: χ² from which on a peak enters.
-        limit: χ² from which on a mode stays, in white noise.
+        enter, limit: χ² from which on a peak enters, and a mode stays, in white noise.
         origins: poles of the modes as they entered, rad/s.
         rejected: poles of rejected candidates as they entered, with their statistic.
         fine: χ² of the lowest decay rate in the residual, by frequency.
@@ -142,12 +133,12 @@ class _Search:
 
     def settle(self, poles: np.ndarray, most_steps: int) -> None:
         """Fit all poles together, outputs weighted by the residual of the fit before."""
-        self.poles, self.converged, self.steps = poles, True, 0
         if poles.size:
             self.poles, self.fits, self.converged, self.steps = fitted_poles(
                 self.records, poles, self.weights, True, most_steps, hold=True, time_limit=self.time_limit
             )
         else:
+            self.poles, self.converged, self.steps = poles, True, 0
             self.fits = [project(record, poles, True) for record in self.records]
         self.noise = np.maximum(noise_level(self.records, self.fits, self.weights), self.floor)
         self.weights = 1.0 / self.noise
@@ -168,22 +159,21 @@ class _Search:
     def remove(self, thoroughly: bool = False) -> bool:
         """Remove poles that are spurious or insignificant; whether any was.
 
-        Args:
-            thoroughly: whether to also remove modes that are insignificant once overlapping modes are refitted without
-                them.
+        With `thoroughly`, also modes that are insignificant once overlapping modes are refitted without them.
         """
         if self.poles.size == 0:
             return False
-        statistic = self.statistic()
+        statistic, shapes = self.statistic(), over_noise(self.fits, self.weights)
         limit = self.limit * np.array([self._noise_ratio(pole) for pole in self.poles])
-        out = spurious_modes(self.poles, over_noise(self.fits, self.weights), statistic, self.bin_width) | (
-            statistic < limit
-        )
+        out = spurious_modes(self.poles, shapes, statistic, self.bin_width) | (statistic < limit)
         if thoroughly:
             for r in map(int, np.flatnonzero(~out)):
                 near = np.flatnonzero(self._overlap(self.poles, self.poles[r]) > LONG.overlaps)
+                if near.size == 1:
+                    continue
                 # χ² in combinations of the outputs that are orthogonal to the shapes of the neighbours
-                if near.size > 1 and self._statistic(r, self._directions(near[near != r])) < limit[r]:
+                beside = self._directions(near[near != r])
+                if amplitude_statistic(self.fits, self.weights, r, beside) < limit[r]:
                     statistic[r] = self._gain(r, near)
                     out[r] = statistic[r] < limit[r]
         for r in map(int, np.flatnonzero(out)):
@@ -198,10 +188,7 @@ class _Search:
 
     def statistic(self) -> np.ndarray:
         """χ² of the amplitudes of each mode at fixed poles, (n_modes,)."""
-        return np.array([self._statistic(r) for r in range(self.poles.size)])
-
-    def _statistic(self, r: int, without: np.ndarray | None = None) -> float:
-        return amplitude_statistic(self.fits, self.weights, r, without)
+        return np.array([amplitude_statistic(self.fits, self.weights, r) for r in range(self.poles.size)])
 
     def _directions(self, which: np.ndarray) -> np.ndarray:
         """Orthonormal directions (n_outputs, n_directions) of the shapes of some modes in all records."""

@@ -78,7 +78,6 @@ class OrderSettings:
     # Least ratio of a decay rate to the frequency step of its transform: the exponential has decayed to e^-25 at the
     # end of the transform.
     coarser: float = 4.0
-    decided: float = 0.1  # predicted decrease of χ² below which a fit is precise enough to decide on a mode
     least_independent: float = 1e-7  # least share of a candidate outside the span of the model, to be distinguishable
     resolved: float = 1e-13  # share of the largest eigenvalue of a Gram matrix, below which a direction is round-off
     # bandwidths by which a mode selected in whitened records may move when refined in the records as measured
@@ -192,13 +191,7 @@ def _identify_stepwise(
     def selected(some: Sequence[Record]) -> tuple[_FreeDecay, _Model]:
         problem = _FreeDecay(some, false_alarm, records, search_time, verdicts)
         selection = OrderSelection(
-            problem,
-            max_modes,
-            ORDER.most_weak,
-            ORDER.most_splits,
-            forgets=False,
-            time_limit=search_time,
-            alone=True,
+            problem, max_modes, ORDER.most_weak, ORDER.most_splits, forgets=False, time_limit=search_time, alone=True
         )
         model = selection.select(problem.nothing)
         problem.rejected = selection.rejected
@@ -218,10 +211,10 @@ def _identify_stepwise(
         if not fewer.poles.size and explained:
             break
         all_modes = np.append(fewer.poles, model.poles[other.lost(model.poles, fewer.poles)])
-        if explained and _residual_share(records, all_modes) < ORDER.whitened_away * _residual_share(
-            records, fewer.poles
-        ):
-            fewer = other.fitted(all_modes, fewer.weights)
+        if explained:
+            share, share_of_fewer = (_residual_share(records, poles) for poles in (all_modes, fewer.poles))
+            if share < ORDER.whitened_away * share_of_fewer:
+                fewer = other.fitted(all_modes, fewer.weights)
         problem, model = other, fewer
     problem.time_limit = time_limit
     return problem.refined(model) if model.poles.size else None
@@ -229,17 +222,11 @@ def _identify_stepwise(
 
 @dataclass(frozen=True, eq=False)
 class _Model:
-    """The modes of the current model and their fit.
+    """The modes of the current model and their fit."""
 
-    Attributes:
-        poles: (n_modes,) rad/s.
-        weights: (n_records, n_outputs) 1 / standard deviation of the noise.
-        fits: projection of each record on the poles.
-    """
-
-    poles: np.ndarray
-    weights: np.ndarray
-    fits: list[Projection]
+    poles: np.ndarray  # (n_modes,) rad/s
+    weights: np.ndarray  # (n_records, n_outputs) 1 / standard deviation of the noise
+    fits: list[Projection]  # one per record
 
     @property
     def residuals(self) -> list[Floats]:
@@ -260,11 +247,10 @@ class _Model:
 
 
 class _FreeDecay:
-    """The `searches.Selection` of free decays: a candidate is a pole of the grid.
+    """The `searches.Selection` of free decays, whitened or as measured: a candidate is a pole of the grid.
 
     Attributes:
-        records: free decays, whitened or as measured.
-        measured: the same as measured, for the test of one nonlinear mode.
+        measured: the records as measured, for the test of one nonlinear mode.
         enter: χ² from which on a candidate is tried.
         limit: gain from which on it stays, in white noise.
         split_off: candidates rejected for splitting a mode, with their gain.
@@ -346,8 +332,7 @@ class _FreeDecay:
         return self.limit * self._noise_ratio(model, pole)
 
     def splits(self, model: _Model, trial: _Model) -> bool:
-        # The new mode is not to blame for modes that were spurious before, nor for those that become spurious without
-        # moving and without overlapping with it.
+        # It does not count if modes were spurious before, or become so without moving or overlapping with the new one.
         before, after = (self._spurious(each, model) for each in (model, trial))
         old, new, width = trial.poles[:-1], trial.poles[-1], self.grids[0].bin_width
         band = np.abs(old.real) + width
@@ -368,17 +353,14 @@ class _FreeDecay:
         A candidate may seem to split a mode only because other modes are missing from the model. The strongest
         candidate of each mode is tried again, all of them together.
         """
-        taken: list[int] = []
-        candidates: list[complex] = []
+        strongest: dict[int, complex] = {}
         for pole, _ in sorted(self.split_off, key=lambda candidate: -candidate[1]):
-            nearest = int(np.argmin(np.abs(model.poles.imag - pole.imag)))
-            if nearest not in taken:
-                taken, candidates = [*taken, nearest], [*candidates, pole]
+            strongest.setdefault(int(np.argmin(np.abs(model.poles.imag - pole.imag))), pole)
         self.split_off.clear()
         n, trial = model.poles.size, model
         with suppress(np.linalg.LinAlgError):
             spurious = np.zeros(0, bool)
-            trial = self.fitted(np.append(model.poles, candidates), model.weights, decide=True)
+            trial = self.fitted(np.append(model.poles, [*strongest.values()]), model.weights, decide=True)
             while trial.poles.size > n and (spurious := self._spurious(trial, trial)).any():
                 trial = self.fitted(trial.poles[~spurious], trial.weights, decide=True)
         return trial if trial.poles.size > n else model
@@ -437,7 +419,7 @@ class _FreeDecay:
 
         With `decide` only as precisely as a decision on a mode needs it.
         """
-        most_steps, enough = (SELECTION.few_steps, ORDER.decided) if decide else (FIT.most_steps, FIT.negligible)
+        most_steps, enough = (SELECTION.few_steps, SELECTION.decided) if decide else (FIT.most_steps, FIT.negligible)
         if poles.size:
             poles, fits, *_ = fitted_poles(
                 self.records, poles, weights, True, most_steps, enough=enough, time_limit=self.time_limit
@@ -499,9 +481,8 @@ class _Grid:
         span = n * dt
         self.bin_width = 2.0 * np.pi / span
         fastest = 0.1 * np.pi / dt
-        self.rates = np.r_[
-            0.0, np.geomspace(1.0 / span, max(fastest, 2.0 / span), max(int(np.log(fastest * span)) + 1, 2))
-        ]
+        n_rates = max(int(np.log(fastest * span)) + 1, 2)
+        self.rates = np.r_[0.0, np.geomspace(1.0 / span, max(fastest, 2.0 / span), n_rates)]
         inside = (omega > np.pi / span) & (omega < np.pi / dt - np.pi / span)
         columns, self.omega = np.flatnonzero(inside), omega[inside]
         self.n_cells = sum(int((rate < SELECTION.most_damped * self.omega).sum()) for rate in self.rates)
@@ -526,10 +507,7 @@ class _Grid:
     def strengths(self, residual: np.ndarray, weights: np.ndarray, poles: np.ndarray) -> np.ndarray:
         """χ² of each candidate, (n_rates, n_frequencies); 0 where the modes of the model are indistinguishable from it.
 
-        Args:
-            residual: (n_samples, n_outputs).
-            weights: (n_outputs,) 1 / noise.
-            poles: of the model, rad/s.
+        From the residual (n_samples, n_outputs), 1 / noise (n_outputs,), and the poles of the model, rad/s.
         """
         weighted = residual * weights
         chi_square = np.zeros((self.rates.size, self.omega.size))

@@ -29,7 +29,7 @@ from workbench.structure.modes import frozen
 
 @dataclass(frozen=True)
 class StartSettings:
-    """Constants of the detection of a decay's start, of spikes, and of exponential settling."""
+    """Constants of the test for a free decay, of the detection of its start, of spikes, and of exponential settling."""
 
     order: int = 32  # of the backward predictor
     block: int = 4  # samples per update of the predictor
@@ -54,12 +54,6 @@ class StartSettings:
     neighbours: int = 8  # on either side, from which a spike is interpolated
     about: int = 200  # samples on either side, from which the interpolation is estimated
     leaps: float = 6.0  # interpolation error of a spike, in standard deviations
-
-
-@dataclass(frozen=True)
-class DecayingSettings:
-    """Constants of the test for a free decay."""
-
     decayed: float = 0.1  # rms of the last tenth over the largest of any tenth, below which a record has decayed
     falling: int = 6  # tenths of decreasing level: by chance in 1 of 720 stationary records
     # Share of the energy that decaying modes leave of a short free decay, at most: 0.05 where noise is a tenth of the
@@ -71,7 +65,7 @@ class DecayingSettings:
     signals: int = 8  # of that fit, evenly spaced among the outputs
 
 
-START, DECAYING = StartSettings(), DecayingSettings()
+START = StartSettings()
 HIGHEST_DEGREE = 8  # of a drift; polynomials of higher degree oscillate like modes
 PART = 16_384  # most samples of a part of a record in the fit of drifts
 # Least number of samples to estimate the predictor and to test it.
@@ -127,35 +121,28 @@ def decays(record: Record) -> bool:
     about = record.outputs - record.outputs[:, -max(record.n_samples // 10, 1) :].mean(axis=1, keepdims=True)
     tenths = [float((part**2).mean()) for part in np.array_split(about, 10, axis=1) if part.size]
     falling = tenths[int(np.argmax(tenths)) :]
-    if tenths[-1] < DECAYING.decayed**2 * max(tenths):
-        return True
-    return (len(falling) >= DECAYING.falling and bool(np.all(np.diff(falling) < 0))) or _explained(record)
+    is_at_rest = tenths[-1] < START.decayed**2 * max(tenths)
+    falls = len(falling) >= START.falling and (np.diff(falling) < 0).all()
+    return bool(is_at_rest or falls or _explained(record))
 
 
 def _explained(record: Record) -> bool:
     """Whether the record falls from the start of a decay on, and decaying modes leave little of it."""
     after = record.between(decay_start(record))
-    stride = -(-after.n_samples // DECAYING.instants)
-    sensors = slice(None, None, -(-after.n_outputs // DECAYING.signals))
+    stride = -(-after.n_samples // START.instants)
+    sensors = slice(None, None, -(-after.n_outputs // START.signals))
     outputs = after.outputs[sensors, ::stride]
     outputs = outputs - outputs.mean(axis=1, keepdims=True)
     energy = [float((part**2).sum()) for part in np.array_split(outputs, 2, axis=1)]
     if not energy[1] < energy[0]:
         return False
-    part = replace(
-        after,
-        outputs=outputs,
-        inputs=np.zeros((0, 0)),
-        input_channels=(),
-        output_channels=after.output_channels[sensors],
-        sample_time=stride * after.sample_time,
-    )
+    part = Record(stride * after.sample_time, outputs, after.output_channels[sensors])
     try:
-        poles = stacked_delays(part, n_modes=DECAYING.modes).poles
+        poles = stacked_delays(part, n_modes=START.modes).poles
     except ValueError:  # too short
         return False
     left = project(part, poles[poles.real < 0], True).residual
-    return float((left**2).sum()) < DECAYING.left * float((outputs**2).sum())
+    return float((left**2).sum()) < START.left * float((outputs**2).sum())
 
 
 def without_spikes(record: Record) -> tuple[Record, float, tuple[str, ...]]:
@@ -223,9 +210,7 @@ def _scaled(record: Record) -> tuple[np.ndarray, float]:
 def _breaks(y: np.ndarray, rounding: float) -> tuple[np.ndarray, np.ndarray]:
     """Squared backward prediction error over its level, (n_samples,), and which samples are breaks, (n_samples,).
 
-    Args:
-        y: (n_signals, n_samples).
-        rounding: variance of quantisation noise.
+    Of signals y (n_signals, n_samples) with quantisation noise of variance `rounding`.
     """
     m, n = y.shape
     order, block = START.order, START.block
@@ -271,14 +256,10 @@ def _dying_away(ratio: np.ndarray, broken: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Columns:
-    """Functions of time whose span is the same after a shift in time: one table serves all parts of a long record.
+    """Functions of time whose span is the same after a shift in time: one table serves all parts of a long record."""
 
-    Attributes:
-        table: (at most PART, n_columns) functions of the samples of a part.
-        shift: T(s), (n_columns, n_columns), of the first sample s of a part: the columns there are table @ T(s).
-    """
-
-    table: np.ndarray
+    table: np.ndarray  # (at most PART, n_columns) functions of the samples of a part
+    # T(s), (n_columns, n_columns), of the first sample s of a part: the columns there are table @ T(s)
     shift: Callable[[int], np.ndarray]
 
     @staticmethod
@@ -348,17 +329,11 @@ def _parts(n: int) -> Iterator[slice]:
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """A drift slower than any mode, or the exponential settling of sensors with a high-pass.
+    """A drift slower than any mode, or the exponential settling of sensors with a high-pass."""
 
-    Attributes:
-        record: without the drift; constants stay.
-        size: (n_outputs,) range of the drift, in the unit of each output; 0 where there is none.
-        time_constant: s, of exponential settling, as of an accelerometer with a high-pass; None of a polynomial drift.
-    """
-
-    record: Record = field(repr=False)
-    size: np.ndarray
-    time_constant: float | None = None
+    record: Record = field(repr=False)  # without the drift; constants stay
+    size: np.ndarray  # (n_outputs,) range of the drift, in the unit of each output; 0 where there is none
+    time_constant: float | None = None  # s, of exponential settling; None of a polynomial drift
 
     @property
     def words(self) -> str:
@@ -378,8 +353,7 @@ def without_drift(record: Record, poles: np.ndarray, *, most: int = HIGHEST_DEGR
     outputs replaces the polynomial where it is likelier.
 
     Args:
-        record: free decay.
-        poles: (n_modes,) of its modes, rad/s; may be empty.
+        poles: (n_modes,) of the modes of the free decay, rad/s; may be empty.
         most: highest degree.
     """
     n, m, dt = record.n_samples, record.n_outputs, record.sample_time
@@ -413,9 +387,8 @@ def without_drift(record: Record, poles: np.ndarray, *, most: int = HIGHEST_DEGR
         each = (drift_part.T @ tried[fixed:]) ** 2 / np.maximum((drift_part**2).sum(axis=0), 1e-300)[:, None]
         settles = gain(each, tried)
         best = int(np.argmax(settles))
-        best_rate = rates[best], settles[best]
+        rate, settling = rates[best], settles[best]
         rates = np.geomspace(rates[max(best - 1, 0)], rates[min(best + 1, rates.size - 1)], START.rates)
-    rate, settling = best_rate
     criterion = settling - penalty * (m + 1)
     of_polynomial = ratio[degree] - penalty * m * degree if likely else 0.0
     time_constant = None

@@ -11,7 +11,7 @@ gives the whole Gauss-Newton matrix H, and s² H^-1 is the Cramér-Rao bound of 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -39,6 +39,8 @@ from workbench.records.record import Record, as_records
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread
 
+Fits = list[Projection]  # of all records on the same poles
+
 
 def unshaped(poles: np.ndarray, record: Record) -> SampledModes:
     """Modes of given poles with placeholder shapes of ones, sorted by frequency: a start for `refine`."""
@@ -56,13 +58,7 @@ def identified(
 ) -> IdentifiedModes:
     """The result of an identification: refined modes with their test statistics, and the poles rejected as noise.
 
-    Args:
-        refined: the modes.
-        statistic: (n_modes,) test statistic of each.
-        limit: threshold of the statistic.
-        rejected: pole, rad/s, and statistic of each rejected candidate.
-        record: for the positions of its sensors.
-        remarks: of the result.
+    From the pole, rad/s, and statistic of each rejected candidate, and a record of the sensors.
     """
     noise = sorted(rejected, key=lambda pair: abs(pair[0]))
     modes = unshaped(np.array([pole for pole, _ in noise], complex), record)
@@ -146,11 +142,7 @@ def as_refined(
     """The modes of a fit with their covariance.
 
     Args:
-        records: of the fit.
-        poles: (n_modes,) rad/s.
-        fits: projections on the poles, one per record.
         noise: (n_records, n_outputs) standard deviations.
-        converged, steps: of the search.
         noise_ratio: κ (n_records, n_outputs, n_modes), variance of the noise about each mode over its mean; 1 unless
             given.
         shared: (n_records, n_modes) variance of each pole over that in noise without correlation between outputs.
@@ -184,10 +176,7 @@ def normal_equations(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Gauss-Newton matrix and right-hand side of (σ, ω_d), over all records, outputs weighted by 1 / noise.
 
-    Args:
-        fits: one per record, of the same poles.
-        weights: (n_records, n_outputs).
-        factor: (n_records, n_modes, n_outputs) of the Jacobian of each mode and output: κ^½ gives J^T S J.
+    `factor` (n_records, n_modes, n_outputs) is of the Jacobian of each mode and output: κ^½ gives J^T S J.
     """
     size = fits[0].gram.shape[0]
     n = size // 2
@@ -212,7 +201,6 @@ def _mean_shapes(
     mode, counts little.
 
     Args:
-        fits: one per record, of the same poles.
         derivative: (n_outputs,) order of the time derivative each output measures.
         pole_covariance: (2 n_modes, 2 n_modes) of (σ, ω_d).
         variance: (n_records, n_outputs, n_modes) of the noise about each mode.
@@ -375,72 +363,49 @@ def fitted_poles(
     step, and a pole beyond the Nyquist frequency is folded back to its alias.
 
     Args:
-        records: free decays.
         poles: (n_modes,) start, rad/s.
         weights: (n_records, n_outputs) 1 / noise.
         offset: whether each output may also hold a constant.
-        most_steps: largest number of steps.
-        hold: see above.
         enough: predicted decrease of χ², per value, at which the search ends.
-        time_limit: of processor time; none unless given.
 
     Returns:
         poles, projections (one per record), whether the search converged, and the number of steps.
     """
-    start = _Fitted(poles, [project(record, poles, offset) for record in records])
+    start = [project(record, poles, offset) for record in records]
     problem = _Poles(start, records, weights, offset, hold, enough)
     minimum = minimise(problem, start, most_steps=most_steps, round_off=problem.round_off, time_limit=time_limit)
-    return minimum.state.poles, minimum.state.fits, minimum.converged, minimum.steps
-
-
-@dataclass(frozen=True, eq=False)
-class _Fitted:
-    poles: np.ndarray
-    fits: list[Projection]
+    return minimum.state[0].poles, minimum.state, minimum.converged, minimum.steps
 
 
 class _Poles:
-    """The `searches.LeastSquares` of free decays.
-
-    Attributes:
-        free: degrees of freedom.
-        signal: energy of the records over the noise.
-        round_off: of the cost.
-    """
+    """The `searches.LeastSquares` of free decays; its state is the projection of each record on the poles."""
 
     def __init__(
-        self,
-        start: _Fitted,
-        records: Sequence[Record],
-        weights: np.ndarray,
-        offset: bool,
-        hold: bool,
-        enough: float,
+        self, start: Fits, records: Sequence[Record], weights: np.ndarray, offset: bool, hold: bool, enough: float
     ) -> None:
         self.records, self.weights, self.offset, self.hold, self.enough = records, weights, offset, hold, enough
-        coefficients = sum(fit.coefficients.size for fit in start.fits)
-        self.free = sum(r.outputs.size for r in records) - 2 * start.poles.size - coefficients
+        coefficients = sum(fit.coefficients.size for fit in start)
+        self.free = sum(r.outputs.size for r in records) - 2 * start[0].poles.size - coefficients
         self.signal = float((weights**2 * _squares(records)).sum())
-        self.round_off = max(fit.round_off for fit in start.fits) * self.signal
+        self.round_off = max(fit.round_off for fit in start) * self.signal
 
-    def cost(self, state: _Fitted) -> float:
-        each = zip(state.fits, self.weights, strict=True)
-        return float(sum(weight**2 @ fit.squares for fit, weight in each))
+    def cost(self, state: Fits) -> float:
+        return float(sum(weight**2 @ fit.squares for fit, weight in zip(state, self.weights, strict=True)))
 
-    def normal_equations(self, state: _Fitted) -> tuple[np.ndarray, np.ndarray]:
-        return normal_equations(state.fits, self.weights)
+    def normal_equations(self, state: Fits) -> tuple[np.ndarray, np.ndarray]:
+        return normal_equations(state, self.weights)
 
-    def moved(self, state: _Fitted, step: np.ndarray) -> tuple[_Fitted | None, np.ndarray]:
-        n = state.poles.size
-        trial = state.poles - step[:n] + 1j * step[n:]
+    def moved(self, state: Fits, step: np.ndarray) -> tuple[Fits | None, np.ndarray]:
+        poles, n = state[0].poles, state[0].poles.size
+        trial = poles - step[:n] + 1j * step[n:]
         if self.hold:
             trial, step = _folded(trial, self.records[0].sample_time), step.copy()
             held = _inadmissible(trial, self.records)
-            trial[held], step[np.tile(held, 2)] = state.poles[held], 0.0
+            trial[held], step[np.tile(held, 2)] = poles[held], 0.0
         if _inadmissible(trial, self.records).any():
             return None, step
         try:
-            return _Fitted(trial, [project(record, trial, self.offset) for record in self.records]), step
+            return [project(record, trial, self.offset) for record in self.records], step
         except np.linalg.LinAlgError:
             return None, step
 

@@ -35,30 +35,20 @@ AFTER_IMPACTS = AfterImpactsSettings()
 
 @dataclass(frozen=True)
 class AfterImpacts:
-    """The modes of free decays, some of which depend on amplitude; empty where none does.
+    """The modes of free decays, some of which depend on amplitude; empty where none does."""
 
-    Attributes:
-        poles: of all modes, rad/s, means over the decays.
-        changing: poles of the amplitude-dependent modes.
-        scatter: rad/s, rms of the frequency of each of these about its mean over a decay.
-        figures: frequency and damping of each of these by amplitude, in words.
-    """
-
-    poles: tuple[complex, ...] = ()
-    changing: tuple[complex, ...] = ()
-    scatter: tuple[float, ...] = ()
-    figures: tuple[str, ...] = ()
+    poles: tuple[complex, ...] = ()  # of all modes, rad/s, means over the decays
+    changing: tuple[complex, ...] = ()  # of the amplitude-dependent modes
+    scatter: tuple[float, ...] = ()  # rad/s, rms of the frequency of each of these about its mean over a decay
+    figures: tuple[str, ...] = ()  # frequency and damping of each of these by amplitude, in words
 
     def among(self, poles: Complexes) -> tuple[complex, ...]:
         """The poles of the identified modes (n_modes,) that are amplitude-dependent ones."""
         return tuple(complex(poles[r]) for r in self._nearest(poles))
 
     def remarks(self, poles: Complexes, size: Floats, deviation: Complexes) -> tuple[str, ...]:
-        """Remarks on the amplitude-dependent modes, numbered as identified, and on modes that are their overtones.
-
-        Args:
-            poles, size, deviation: of the modes identified, as `overtone_remarks` takes them.
-        """
+        """Remarks on the amplitude-dependent modes, numbered as identified, and on modes that are their overtones; the
+        arguments are those of `overtone_remarks`."""
         means, scatter, words = poles.copy(), np.zeros(poles.size), []
         for r, k in self._nearest(poles).items():
             means[r], scatter[r] = self.changing[k], self.scatter[k]
@@ -79,20 +69,14 @@ class AfterImpacts:
 
 
 def after_impacts(records: Sequence[Record], time_limit: TimeLimit) -> AfterImpacts:
-    """The amplitude-dependent modes, where every record ends in free decay; none otherwise.
-
-    Args:
-        records: inputs zero between impacts.
-        time_limit: of the identification; a share of it is used.
-    """
-    decays = [_free_decay(record) for record in records]
-    if not all(decays):
+    """The amplitude-dependent modes, where every record, zero between impacts, ends in free decay; none otherwise."""
+    decays = [decay for record in records if (decay := _free_decay(record))]
+    if len(decays) < len(records):
         return AfterImpacts()
-    free = [decay for decay in decays if decay is not None]
     share = time_limit.aside(AFTER_IMPACTS.share)
     with suppress(ValueError, np.linalg.LinAlgError):  # no mode in free decay: the driven response alone is used
-        refined = identify_within(free, share).without_artefacts(np.pi / free[0].sample_time).refined
-        by_amplitude = amplitude_dependence(free, refined, time_limit=share)
+        refined = identify_within(decays, share).without_artefacts(np.pi / decays[0].sample_time).refined
+        by_amplitude = amplitude_dependence(decays, refined, time_limit=share)
         if not share.unfinished:
             return _significant(refined, by_amplitude)
     return AfterImpacts()
@@ -110,13 +94,11 @@ def _free_decay(record: Record) -> Record | None:
 
 def _significant(refined: RefinedModes, by_amplitude: AmplitudeDependence) -> AfterImpacts:
     """The amplitude-dependent modes whose frequency varies by a significant part of the bandwidth."""
-    poles, changing, scatter = refined.modes.poles, [], []
-    for r in np.flatnonzero(by_amplitude.depends).tolist():
-        omega = by_amplitude.omega[np.isfinite(by_amplitude.omega[:, r]), r]
-        if np.ptp(omega) > AFTER_IMPACTS.matters * abs(poles[r].real):
-            changing.append(r)
-            scatter.append(float(omega.std()))
+    poles, depends = refined.modes.poles, np.flatnonzero(by_amplitude.depends).tolist()
+    omega = {r: by_amplitude.omega[np.isfinite(by_amplitude.omega[:, r]), r] for r in depends}
+    changing = [r for r in depends if np.ptp(omega[r]) > AFTER_IMPACTS.matters * abs(poles[r].real)]
     if not changing:
         return AfterImpacts()
+    scatter = tuple(float(omega[r].std()) for r in changing)
     figures = tuple(by_amplitude.as_text(r) for r in changing)
-    return AfterImpacts(tuple(poles.tolist()), tuple(poles[changing].tolist()), tuple(scatter), figures)
+    return AfterImpacts(tuple(poles.tolist()), tuple(poles[changing].tolist()), scatter, figures)

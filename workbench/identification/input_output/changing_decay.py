@@ -20,18 +20,16 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from workbench.arrays import Floats
-from workbench.identification.free_decay.backbone import POWERS, backbone_integrals
+from workbench.identification.free_decay.backbone import BACKBONE, POWERS, backbone_integrals
 from workbench.identification.input_output.competing_models import (
     COMPETING,
     bases_with_changes,
     beyond_linear,
-    diverged,
     in_place_of_clusters,
-    projected_residual,
 )
 from workbench.identification.input_output.modal_fit import Fit, regressors, row_weights
 from workbench.identification.input_output.spectral_lines import Lines, rows_of_pair
-from workbench.identification.signal.searches import CachedResidual, TimeLimit
+from workbench.identification.signal.searches import CachedResidual, TimeLimit, diverged, projected_residual
 from workbench.structure.modes import mac
 
 
@@ -39,7 +37,6 @@ from workbench.structure.modes import mac
 class ChangingDecaySettings:
     """Constants of the search for one changing mode in place of several linear ones."""
 
-    alike: float = 0.9  # MAC of such linear modes
     smooth: int = 2  # degree of the polynomial for the residual of the other modes
     knots: int = 100  # of the spline in time
     ends: float = 8.0  # duration of a decay, in time constants
@@ -51,30 +48,16 @@ DECAY = ChangingDecaySettings()
 
 
 def beside_changing(lines: Lines, fit: Fit, limit: float, time_limit: TimeLimit) -> tuple[Lines, Fit] | None:
-    """The lines with the columns of changing modes, and the fit with one mode for each of these.
-
-    Args:
-        lines: FRFs.
-        fit: of linear modes.
-        limit: χ² threshold of a linear mode.
-        time_limit: of time.
-
-    Returns:
-        None where linear modes are likelier at every peak.
-    """
+    """The lines with the columns of changing modes, and the fit with one mode for each of these; None where linear
+    modes, of χ² threshold `limit`, are likelier at every peak."""
     shapes, participation = fit.amplitudes / fit.noise[:, None], fit.participation.T
-    alike = mac(shapes, shapes) * mac(participation, participation) > DECAY.alike
+    alike = mac(shapes, shapes) * mac(participation, participation) > COMPETING.alike
     within = (fit.poles.imag > lines.omega[0]) & (fit.poles.imag < lines.omega[-1])
-    return in_place_of_clusters(
-        lines,
-        fit,
-        alike & within & within[:, None],
-        lambda lines, cluster: _alternative_of(lines, fit, cluster, limit),
-        time_limit,
-    )
+    alternative_of = partial(_alternative_of, fit=fit, limit=limit)
+    return in_place_of_clusters(lines, fit, alike & within & within[:, None], alternative_of, time_limit)
 
 
-def _alternative_of(lines: Lines, fit: Fit, cluster: np.ndarray, limit: float) -> tuple[Lines, complex] | None:
+def _alternative_of(lines: Lines, cluster: np.ndarray, fit: Fit, limit: float) -> tuple[Lines, complex] | None:
     """`in_place_of_clusters`, for one cluster: the lines beside the changing mode, and its pole."""
     weighted_shape, poles = fit.amplitudes[:, cluster[0]] / fit.noise**2, fit.poles[cluster]
     strength = weighted_shape.conj() @ fit.amplitudes[:, cluster]
@@ -92,17 +75,14 @@ def _alternative_of(lines: Lines, fit: Fit, cluster: np.ndarray, limit: float) -
             break
         changing = peak.fitted(law, peak.starts(law, n_coefficients, linear_decay))
         # As in a free decay, two modes must be likelier than one by the threshold of a further mode.
-        if changing is not None and changing.log_likelihood >= linear.log_likelihood - limit * (cluster.size - 1):
-            return _beside(lines, peak.decays, changing.motions)
+        if changing is not None and changing[0] >= linear[0] - limit * (cluster.size - 1):
+            return _beside(lines, peak.decays, changing[1])
     return None
 
 
 def _beside(lines: Lines, decays: "_Decays", motions: np.ndarray) -> tuple[Lines, complex]:
-    """The lines with the columns of the changing mode, and its pole.
-
-    Args:
-        motions: (n_knots, 1 + n_unknowns) m, and its changes with the unknowns.
-    """
+    """The lines with the columns of the changing mode, and its pole, from m, and its changes with the unknowns,
+    (n_knots, 1 + n_unknowns)."""
     l_r, time, m = decays.participation, decays.time, motions[:, 0]
     power = np.abs(m) ** 2 * np.exp(2.0 * decays.pole.real * time)
     frequency = np.gradient(np.unwrap(np.angle(m)), time)
@@ -155,9 +135,8 @@ def _linear(decays: _Decays, coefficients: np.ndarray) -> np.ndarray:
 
 def _by_time(decays: _Decays, coefficients: np.ndarray) -> np.ndarray:
     """m = exp(Σ_k c_k t^k)."""
-    return np.asarray(
-        np.exp((decays.rate * decays.time)[:, None] ** np.arange(1, coefficients.size + 1) @ coefficients)
-    )
+    powers = (decays.rate * decays.time)[:, None] ** np.arange(1, coefficients.size + 1)
+    return np.asarray(np.exp(powers @ coefficients))
 
 
 def _spread(decays: _Decays, coefficients: np.ndarray) -> np.ndarray:
@@ -187,12 +166,6 @@ LAWS: tuple[tuple[int, Law], ...] = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class _Fitted:
-    log_likelihood: float  # twice the log-likelihood, up to a constant
-    motions: np.ndarray  # m, and its change with each unknown, (n_knots, 1 + n_unknowns)
-
-
 class _Peak:
     """The fit of laws about a peak by variable projection of amplitudes and polynomials.
 
@@ -208,7 +181,8 @@ class _Peak:
         self.bases = bases_with_changes(rows, fit, others, list(self.weights))
         self.values = self._beyond_others(lines.values.T)
 
-    def fitted(self, law: Law, starts: list[np.ndarray]) -> _Fitted | None:
+    def fitted(self, law: Law, starts: list[np.ndarray]) -> tuple[float, np.ndarray] | None:
+        """Twice the log-likelihood of a law, up to a constant; m and its change with each unknown, (n_knots, k)."""
         once, best, smallest = CachedResidual(lambda x: self._residual(self._motions(law, x))), None, np.inf
         for start in starts:
             unknowns = np.r_[start.real, start.imag]
@@ -223,7 +197,7 @@ class _Peak:
         residual = once(best)[0].reshape(self.noise.size, -1)
         floor = 1e-24 * (np.array(self.values) ** 2).sum(axis=1) + 1e-300
         logs = np.log((residual**2).sum(axis=1) + floor).sum()
-        return _Fitted(-residual.shape[1] * float(logs), self._motions(law, best))
+        return -residual.shape[1] * float(logs), self._motions(law, best)
 
     def starts(self, law: Law, size: int, decay: np.ndarray) -> list[np.ndarray]:
         """Two starts of a law of so many coefficients: a fit to m (n_knots,) of the linear modes, and no change."""
@@ -242,15 +216,21 @@ class _Peak:
 
         with np.errstate(over="ignore", invalid="ignore"):
             m = motion(unknowns)
-            steps = COMPETING.slightly * np.eye(unknowns.size)
-            return np.column_stack([m, *((motion(unknowns + step) - m) / COMPETING.slightly for step in steps)])
+            steps = BACKBONE.slightly * np.eye(unknowns.size)
+            return np.column_stack([m, *((motion(unknowns + step) - m) / BACKBONE.slightly for step in steps)])
 
     def _residual(self, motions: np.ndarray) -> tuple[Floats, Floats]:
         """Residual (n,) and its Jacobian (n, n_unknowns)."""
         if not (np.abs(motions) < DECAY.largest).all():
-            return diverged(self.values, motions.shape[1] - 1)
-        rows = np.hstack(self.decays.rows(motions))
-        return projected_residual(self.values, self._beyond_others([weight * rows for weight in self.weights]))
+            return diverged(np.concatenate(self.values), motions.shape[1] - 1)
+        rows, n = np.hstack(self.decays.rows(motions)), motions.shape[1]
+
+        def of_output(y: Floats, x: Floats) -> tuple[Floats, Floats]:
+            return projected_residual(y, x[:, [0, n]], lambda c: c[0] * x[:, 1:n] + c[1] * x[:, n + 1 :])
+
+        beyond = self._beyond_others([weight * rows for weight in self.weights])
+        residuals, jacobians = zip(*map(of_output, self.values, beyond), strict=True)
+        return np.concatenate(residuals), np.vstack(jacobians)
 
     def _beyond_others(self, outputs: Iterable[Floats]) -> list[Floats]:
         """What the other modes do not explain of each output, (n_rows,) or (n_rows, k), in units of its noise."""

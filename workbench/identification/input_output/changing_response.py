@@ -17,16 +17,11 @@ from numba import njit
 from scipy.optimize import least_squares
 
 from workbench.arrays import Floats
-from workbench.identification.input_output.competing_models import (
-    COMPETING,
-    bases_with_changes,
-    beyond_linear,
-    diverged,
-)
+from workbench.identification.input_output.competing_models import COMPETING, bases_with_changes, beyond_linear
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit
 from workbench.identification.input_output.noise_spectrum import lines_of
-from workbench.identification.signal.searches import TimeLimit
+from workbench.identification.signal.searches import TimeLimit, diverged, projected_residual
 
 
 @dataclass(frozen=True)
@@ -46,7 +41,7 @@ class ChangingResponseSettings:
     # the same of the law of time, from which no other law is tried. It was 3.5 at most where one of amplitude was right
     linear: float = 5.0
     # evaluations within which the same must fall, by a share of what is left or by the least that counts. Laws that
-    # were right in the end halved it by each, until it was none by the third; wrong ones crept on for 15 to 40
+    # were right in the end halved it by each, until it was none by the third; wrong ones fell slowly for 15 to 40
     within: int = 2
     stalled: float = 0.5
     same: float = 0.1  # decay rates, by which the poles of a cluster that is not tried again may have moved
@@ -70,13 +65,9 @@ LAWS: tuple[Law, ...] = (
 
 @dataclass(eq=False)
 class _GivenUp(Exception):
-    """A law is far off after its first step or falls no more, or the time is spent.
+    """A law is far off after its first step or falls no more, or the time is spent."""
 
-    Attributes:
-        least: logarithm of the squares beyond the threshold.
-    """
-
-    least: float
+    least: float  # logarithm of the squares beyond the threshold
 
 
 def in_place_of(
@@ -90,10 +81,9 @@ def in_place_of(
 ) -> tuple[KnownInputs, complex] | None:
     """`in_place_of_clusters`, for one cluster: the records beside the changing mode, and its pole.
 
-    Args:
-        rows: `regressors` of the fit.
-        linear: poles of each cluster that no law replaced with an earlier estimate of the noise, added to. They are not
-            tried again: about a few modes it weights all lines much alike, whichever the model.
+    From the `regressors` of the fit. `linear` are the poles of each cluster that no law replaced with an earlier
+    estimate of the noise, added to. They are not tried again: about a few modes it weights all lines much alike,
+    whichever the model.
     """
     poles = fit.poles[cluster]
     same = -RESPONSE.same * poles.real
@@ -260,27 +250,24 @@ class _Response:
     """
 
     def __init__(self, data: KnownInputs, fit: Fit, cluster: np.ndarray, rows: Floats) -> None:
-        self.data, self.fit = data, fit
-        poles = fit.poles[cluster]
+        self.data, self.fit, self.cluster, poles = data, fit, cluster, fit.poles[cluster]
         rates = np.maximum(-poles.real, COMPETING.slowest * data.resolution)
         power = np.abs(fit.amplitudes[:, cluster] / fit.noise[:, None]).max(axis=0) ** 2 / rates
         self.pole = complex(np.average(-rates + 1j * poles.imag, weights=power))
         self.rate, self.participation = -self.pole.real, fit.participation[cluster[0]]
-        self.cluster = cluster
         margin = max(COMPETING.about * self.rate, COMPETING.fewest * data.resolution)
         self.low, self.high = poles.imag.min() - margin, poles.imag.max() + margin
         self.coordinates = self._coordinates(self.pole)
         norms = np.sqrt(sum((np.abs(z) ** 2).sum(axis=0) for z in self.coordinates))
-        held = int(np.argmax(norms * np.abs(self.participation)))
-        self.participation = self.participation / self.participation[held]
-        self.held = held
-        self.others = np.delete(np.arange(norms.size), held)
-        self.units = norms[held] / np.maximum(norms[self.others], 1e-300)
+        self.held = int(np.argmax(norms * np.abs(self.participation)))
+        self.participation = self.participation / self.participation[self.held]
+        self.others = np.delete(np.arange(norms.size), self.held)
+        self.units = norms[self.held] / np.maximum(norms[self.others], 1e-300)
         self.scale = max(max(float(np.abs(z @ self.participation).max()) for z in self.coordinates), 1e-300)
-        energy = [np.abs(z @ self.participation) ** 2 for z in self.coordinates]
-        share = np.concatenate([np.linspace(0.0, 1.0, each.size) for each in energy])
-        self.middle = float(np.average(share, weights=np.concatenate(energy) + 1e-300))
-        self.width = float(np.sqrt(np.average((share - self.middle) ** 2, weights=np.concatenate(energy) + 1e-300)))
+        energy = np.concatenate([np.abs(z @ self.participation) ** 2 for z in self.coordinates]) + 1e-300
+        share = np.concatenate([np.linspace(0.0, 1.0, len(z)) for z in self.coordinates])
+        self.middle = float(np.average(share, weights=energy))
+        self.width = float(np.sqrt(np.average((share - self.middle) ** 2, weights=energy)))
         self.weight = np.ones((1, 1))
         if data.weights is not None:
             self.weight = np.vstack([self._about(data.weights[part]) for part in data.rows])
@@ -309,11 +296,8 @@ class _Response:
     def fitted(self, law: Law, threshold: float, time_limit: TimeLimit) -> tuple[KnownInputs, complex] | None:
         """The records beside the changing mode of a law, and its pole; None where it leaves too large a residual.
 
-        Args:
-            threshold: largest logarithm of the squares of the residual.
-
-        Raises:
-            _GivenUp: the first step leaves far more, the fit stalls above the threshold, or the time is spent.
+        The threshold is the largest logarithm of its squares. _GivenUp where the first step leaves far more, the fit
+        stalls above the threshold, or the time is spent.
         """
         start = self._start(law)
         best = np.r_[start.real, start.imag]
@@ -368,20 +352,17 @@ class _Response:
         return np.asarray(np.r_[coefficients, self.linear_factors])
 
     def _motions_of_linear(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """The sum of the linear modes in each record, and its rate beyond that of the constant mode times it.
-
-        Over the rate of decay, (n_samples - 1,) each.
-        """
+        """The sum of the linear modes in each record, and its rate beyond that of the constant mode times it, over the
+        rate of decay, (n_samples - 1,) each."""
         fit, dt = self.fit, self.data.dt
         poles, participation = fit.poles[self.cluster], fit.participation[self.cluster]
         strength = (fit.amplitudes[:, self.cluster[0]] / fit.noise**2).conj() @ fit.amplitudes[:, self.cluster]
         factors = strength @ participation
         unit = factors[self.held]
         self.linear_factors = (factors[self.others] / unit - self.participation[self.others]) / self.units
-        each_pole = [self._coordinates(pole) for pole in poles]
-        for k in range(len(self.coordinates)):
-            each = zip(strength / unit, each_pole, participation, strict=True)
-            modes = [a * (z[k][:-1] @ l_r) for a, z, l_r in each]
+        for of_record in zip(*(self._coordinates(pole) for pole in poles), strict=True):
+            each = zip(strength / unit, of_record, participation, strict=True)
+            modes = [a * (z[:-1] @ l_r) for a, z, l_r in each]
             z = np.sum(modes, axis=0)
             propagated = np.exp((poles - self.pole) * dt) @ modes
             yield z, (propagated - z) / dt / self.rate
@@ -412,20 +393,20 @@ class _Response:
         return motions
 
     def _residual(self, unknowns: Floats, law: Law, slopes: bool = False) -> tuple[Floats, Floats]:
-        """Residual (n,) with the shape of the motion projected out, and its Jacobian (n, n_unknowns), where asked for.
-
-        The Jacobian is that of Kaufman (1975).
-        """
+        """Residual (n,) with the shape of the motion projected out, and its Jacobian (n, n_unknowns) where asked for,
+        that of Kaufman (1975)."""
         motions = self._motions(unknowns, law, slopes)
         if not all(np.isfinite(z[-1]).all() for z in motions):
-            return diverged([self.values], unknowns.size)
-        q, r = np.linalg.qr(self._beyond_others([np.column_stack([z[:, 0].real, z[:, 0].imag]) for z in motions]))
-        in_motion = q.T @ self.values
-        a, b = np.linalg.lstsq(r, in_motion, rcond=1e-12)[0]
-        tangents = np.zeros((self.values.size, 0))
-        if slopes:
-            tangents = self._beyond_others([a * z[:, 1:].real + b * z[:, 1:].imag for z in motions])
-        return np.asarray(self.values - q @ in_motion), np.asarray(q @ (q.T @ tangents) - tangents)
+            return diverged(self.values, unknowns.size)
+
+        def tangents_of(coefficients: Floats) -> Floats:
+            if not slopes:
+                return np.zeros((self.values.size, 0))
+            a, b = coefficients
+            return self._beyond_others([a * z[:, 1:].real + b * z[:, 1:].imag for z in motions])
+
+        columns = self._beyond_others([np.column_stack([z[:, 0].real, z[:, 0].imag]) for z in motions])
+        return projected_residual(self.values, columns, tangents_of)
 
     def _beyond_others(self, samples: Sequence[Floats]) -> Floats:
         """What the other modes do not explain of columns (n_samples, k) of each record, in the lines that count."""
@@ -438,8 +419,5 @@ class _Response:
 
     def _about(self, lines: Floats) -> Floats:
         """Those of the lines of one record that lie about the cluster."""
-        return lines[self._within(len(lines))]
-
-    def _within(self, n_lines: int) -> slice:
-        line = np.pi / self.data.dt / n_lines
-        return slice(max(int(self.low / line), 0), min(int(self.high / line) + 2, n_lines))
+        line = np.pi / self.data.dt / len(lines)
+        return lines[max(int(self.low / line), 0) : min(int(self.high / line) + 2, len(lines))]

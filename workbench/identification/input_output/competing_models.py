@@ -18,7 +18,6 @@ from workbench.identification.input_output.modal_fit import (
     MANY_ROWS,
     Fit,
     Measurement,
-    Pair,
     changes_of,
     combinations,
     modal_coordinate,
@@ -39,7 +38,7 @@ class CompetingModelSettings:
     about: float = 12.0  # half-power half-widths beyond the modes, in which the models are compared
     fewest: int = 25  # lines beyond the modes, likewise at least
     slowest: float = 0.05  # of the distance of lines: smallest decay rate
-    slightly: float = 1e-5  # of the decay rate: step of finite differences
+    alike: float = 0.9  # MAC of such modes
     most_poles: int = 20  # steps to the linear mode nearest to a changing one
     same_pole: float = 1e-6  # of the decay rate: a smaller step ends them
     collinear: float = 1e-9  # singular value of columns of unit length, below which it is rounding error
@@ -61,16 +60,12 @@ def in_place_of_clusters(
 ) -> tuple[Data, Fit] | None:
     """The measurement with the columns of changing modes, and the fit with one mode for each cluster that one replaces.
 
+    None where linear modes are likelier everywhere.
+
     Args:
-        data: the measurement that `fit` describes.
-        fit: of linear modes.
         alike: (n_modes, n_modes) whether two modes may be one, by their shapes.
         alternative_of: the measurement with the columns of a changing mode in place of a cluster of modes, the
             strongest first, and the pole of the nearest linear mode, rad/s; None where the linear modes are likelier.
-        time_limit: of time.
-
-    Returns:
-        None where linear modes are likelier everywhere.
     """
     strength = statistic_of_each(fit)
     rates = np.maximum(-fit.poles.real, 0.5 * data.resolution)
@@ -123,11 +118,8 @@ def orthonormal_basis(rows: np.ndarray, least: float) -> Floats:
 def beyond_linear(data: Measurement, motions: np.ndarray, pole: complex, l_r: np.ndarray) -> tuple[Floats, complex]:
     """Orthonormal columns of a motion beyond the nearest linear mode, (n_rows, n_columns), and the pole of that mode.
 
-    Orthogonal to that mode, its slope by the pole, and the fixed columns.
-
-    Args:
-        motions: (n_rows, n_motions) of a changing mode, and of its changes with the unknowns.
-        pole: from which the nearest linear mode, of participation factors l_r, is searched.
+    Orthogonal to that mode, its slope by the pole, and the fixed columns. Motions (n_rows, n_motions) are those of a
+    changing mode, and its changes with the unknowns. The search begins at `pole`.
     """
     pole = _nearest_pole(data, motions[:, 0], pole, l_r)
     linear = np.column_stack([*modal_coordinate(data.responses(pole), l_r), *data.slopes(pole, l_r)])
@@ -141,11 +133,8 @@ def bases_with_changes(
 ) -> list[Floats]:
     """Orthonormal columns of some modes, the fixed columns and first-order changes of the modes, one matrix per output.
 
-    Args:
-        rows: those that count of the `regressors` of the fit.
-        modes: their indices.
-        weights: (n_rows, 1) of each output, inverse relative noise.
-        poles_only: whether only poles may change, or participation factors too.
+    From those rows that count of the `regressors` of the fit, and the inverse relative noise (n_rows, 1) of each
+    output. Only poles may change, or participation factors too.
     """
     n, of_mode = fit.poles.size, fit.participation.shape[1] + 1
     chosen = (of_mode * modes[:, None] + np.arange(of_mode)).ravel()
@@ -157,34 +146,6 @@ def bases_with_changes(
         each = weight * np.hstack([phi, changes_of(a, (real[:, ::step], imaginary[:, ::step]))])
         bases.append(orthonormal_basis(normalised_columns(each), COMPETING.collinear))
     return bases
-
-
-def projected_residual(values: Sequence[Floats], motions: Sequence[Floats]) -> Pair:
-    """Residual of all outputs with the shape of a motion projected out, and its Jacobian (Kaufman 1975).
-
-    (n_outputs n_lines,) and (n_outputs n_lines, n_unknowns).
-
-    Args:
-        values: of each output, (n_lines,).
-        motions: of each output, (n_lines, 2 (1 + n_unknowns)) real parts of the motion and of its slopes by the
-            unknowns, then imaginary ones.
-    """
-    residuals, jacobians = [], []
-    for y, x in zip(values, motions, strict=True):
-        n = x.shape[1] // 2
-        q, r = np.linalg.qr(x[:, [0, n]])
-        in_motion = q.T @ y
-        a, b = np.linalg.lstsq(r, in_motion, rcond=1e-12)[0]
-        tangents = a * x[:, 1:n] + b * x[:, n + 1 :]
-        residuals.append(y - q @ in_motion)
-        jacobians.append(q @ (q.T @ tangents) - tangents)
-    return np.concatenate(residuals), np.vstack(jacobians)
-
-
-def diverged(values: Sequence[Floats], n_unknowns: int) -> Pair:
-    """In place of `projected_residual` where the motion diverges: a large residual that no unknown changes."""
-    residual = 10.0 * np.abs(np.concatenate(values))
-    return residual, np.zeros((residual.size, n_unknowns))
 
 
 def _nearest_pole(data: Measurement, motion: np.ndarray, pole: complex, l_r: np.ndarray) -> complex:

@@ -13,7 +13,6 @@ import numpy as np
 from workbench.arrays import Floats, scaled_inverse, symmetric_root
 from workbench.identification.input_output.modal_fit import (
     Fit,
-    Part,
     free_parameters,
     normal_equations,
     scaled_vectors,
@@ -30,8 +29,9 @@ def covariance(fit: Fit, noise_ratio: np.ndarray | float = 1.0) -> np.ndarray:
     if np.all(noise_ratio == 1.0):
         return bound
     ratios = np.broadcast_to(noise_ratio, (fit.noise.size, fit.poles.size))
+    n = 2 * fit.poles.size
     rescaled = tuple(
-        replace(part, coefficients=part.coefficients * _by_column(part, ratios[outputs]))
+        replace(part, coefficients=part.coefficients[:n] * np.tile(np.sqrt(ratios[outputs]).T, (2, 1)))
         for part, outputs in fit.outputs()
     )
     return np.asarray(bound @ normal_equations(replace(fit, parts=rescaled), fit.noise)[0] @ bound)
@@ -104,7 +104,7 @@ def vector_covariance(
     n_inputs: int,
     further: Floats | None = None,
 ) -> np.ndarray:
-    """Covariance of each mode's relative shape and of its participation factors.
+    """Covariance of each mode's relative shape and participation factors, (n_kept, k, k), k = n_outputs + 2 n_inputs.
 
     The shape is over its largest entry, real part; then real and imaginary parts of the participation factors.
 
@@ -114,9 +114,6 @@ def vector_covariance(
         kept: (n_kept,) indices of the modes that are reported.
         n_inputs: number of excitations, the first ones, that are inputs.
         further: as in `propagated_covariance`.
-
-    Returns:
-        (n_kept, k, k), k = n_outputs + 2 n_inputs.
     """
     k = len(fit.amplitudes) + 2 * n_inputs
     if not kept.size:
@@ -140,10 +137,8 @@ def vector_covariance(
 def fixed_std(fit: Fit, noise_ratio: np.ndarray, fixed: np.ndarray, further: Floats | None = None) -> np.ndarray:
     """Standard errors of the coefficients of the fixed columns, (n_fixed, n_outputs).
 
-    Args:
-        noise_ratio: κ, (n_outputs, n_modes).
-        fixed: κ of each fixed column and output, (n_fixed, n_outputs).
-        further: as in `propagated_covariance`.
+    From κ (n_outputs, n_modes), and `fixed`, that of each fixed column and output. `further` as in
+    `propagated_covariance`.
     """
     bound, free, n, variances = covariance(fit, noise_ratio), free_parameters(fit), 2 * fit.poles.size, []
     for part, outputs in fit.outputs():
@@ -195,12 +190,6 @@ def marginal_statistics_of(fit: Fit) -> np.ndarray:
         # Nearly identical modes make it singular.
         statistics[r] = c * scale @ np.linalg.pinv(spread * np.outer(scale, scale), hermitian=True) @ (c * scale)
     return statistics
-
-
-def _by_column(part: Part, rows: np.ndarray) -> np.ndarray:
-    """κ^½ of each column of a part, 1 for fixed columns, (n_columns, n_outputs)."""
-    coordinates = np.tile(np.sqrt(rows).T, (2, 1))
-    return np.vstack([coordinates, np.ones((part.coefficients.shape[0] - len(coordinates), len(rows)))])
 
 
 def scaled_root(matrix: np.ndarray) -> np.ndarray:

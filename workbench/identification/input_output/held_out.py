@@ -16,7 +16,7 @@ from scipy.stats import f as variance_ratio
 from workbench.arrays import Flags, Floats
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, columns, only, projected, settled
-from workbench.identification.input_output.time_variance import IS_MEAN, named_near
+from workbench.identification.input_output.time_variance import CHANGING, IS_MEAN, named_near
 from workbench.identification.signal.searches import FALSE_ALARM, SELECTION, TimeLimit
 from workbench.records.record import Record
 
@@ -25,7 +25,6 @@ from workbench.records.record import Record
 class HeldOutSettings:
     """Constants of the prediction of held-out data."""
 
-    reach: float = 0.15  # of the frequency of a mode, within which weaker modes may model its distortion
     # ratio of the squared errors without and with these modes, below which they are removed. In sensor noise alone the
     # removal of true modes multiplies the error, and that of needless ones changes it by less than a tenth
     worse: float = 0.8
@@ -48,14 +47,11 @@ def without_unpredictive(
 ) -> tuple[Fit, tuple[complex, ...]]:
     """The fit without modes that make the prediction worse, and the poles of the stronger modes these stood about.
 
-    The weaker modes about each stronger one are tested together. Then faint modes that are undamped within the record
-    are tested one by one: each fits a single line.
-
-    Args:
-        strength: (n_modes,) statistic of each mode.
+    The weaker modes, by their statistic `strength`, about each stronger one are tested together. Then faint modes that
+    are undamped within the record are tested one by one: each fits a single line.
     """
     n, omega = fit.poles.size, fit.poles.imag
-    reach = HELD_OUT.reach * omega
+    reach = CHANGING.reach * omega
     weaker_near = (np.abs(np.subtract.outer(omega, omega)) < reach[:, None]) & (strength < strength[:, None])
     undamped = -fit.poles.real < 0.5 * data.resolution
     shortest = min(record.n_samples // 2 for record in data.records)
@@ -80,7 +76,7 @@ def without_unpredictive(
                 errors = whole.as_samples((whole.values - predicted) / noise)
         except np.linalg.LinAlgError:
             return None
-        seconds = [each[rows.stop - rows.start :] for each, rows in zip(errors, half.rows, strict=True)]
+        seconds = [each[n_first:] for each, n_first in zip(errors, half.lengths, strict=True)]
         if not all(np.isfinite(each).all() for each in seconds):
             return None
         return [_power(each) for each in seconds]
@@ -118,10 +114,8 @@ def _first_half(record: Record) -> Record:
 
 def _is_in_both(data: KnownInputs, fit: Fit, r: int) -> bool:
     """Whether both halves of the records hold a fair share of the energy of mode r."""
-    halves = []
-    for z in data.modal_coordinate(fit.poles[r], fit.participation[r]):
-        power = np.abs(z) ** 2
-        halves.append((float(power[: z.size // 2].sum()), float(power[z.size // 2 :].sum())))
+    powers = [np.abs(z) ** 2 for z in data.modal_coordinate(fit.poles[r], fit.participation[r])]
+    halves = [(float(power[: power.size // 2].sum()), float(power[power.size // 2 :].sum())) for power in powers]
     return sum(map(min, halves)) > HELD_OUT.least * sum(map(sum, halves))
 
 
@@ -179,12 +173,11 @@ class _ResidualSpectra:
 def left_about(data: KnownInputs, fit: Fit) -> tuple[complex, ...]:
     """The poles of a fit with a significant residual about them, of a size that matters beside the response.
 
-    Where the residual about one mode is very large, least squares leave a little about the others too; these do not
-    count.
+    Where it is very large about one mode, least squares leave a little about the others too; these do not count.
     """
     whole = replace(data, line_std=None, beside=None, changing=())
     spectra = _ResidualSpectra(whole, projected(whole, fit.poles, fit.participation))
-    bands = fit.poles.imag[:, None] * (1.0 + 0.5 * HELD_OUT.reach * np.array([-1.0, 1.0]))
+    bands = fit.poles.imag[:, None] * (1.0 + 0.5 * CHANGING.reach * np.array([-1.0, 1.0]))
     residual, response = np.array([spectra.between(*band) for band in bands]).reshape(-1, 2).T
     significant = residual > np.maximum(HELD_OUT.matters * response, HELD_OUT.beside * residual.max(initial=0.0))
     return tuple(complex(fit.poles[r]) for r in np.flatnonzero(significant) if spectra.stands_out(*bands[r]))

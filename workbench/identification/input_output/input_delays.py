@@ -1,4 +1,4 @@
-"""The modes of records with known inputs and the delay of each input.
+"""The modes of records with known inputs, the delay of each input, and its course between samples.
 
 Whole samples are those of an ARX model, the fraction of a sample follows from the modes.
 
@@ -10,7 +10,7 @@ these do not depend on f; f is then the one that makes the modes most nearly rea
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -27,7 +27,7 @@ from workbench.identification.input_output.model_order import ORDER, SelectedMod
 from workbench.identification.input_output.selection import select, select_strongest, subspace_start
 from workbench.identification.signal.modal_estimates import time_derivatives
 from workbench.identification.signal.searches import FALSE_ALARM, SELECTION, TimeLimit
-from workbench.records.record import Record
+from workbench.records.record import HOLDS, Record
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,6 @@ class DelaysSettings:
     most_lags: int = 60  # of the ARX model
     rows_each: int = 8  # rows for each of its coefficients, at least
     part: int = 4096  # rows of the data matrix held at once
-    floor: float = 1e-5  # noise floor of each output, relative: -100 dB
     round_off: float = 1e-8  # of the ratio of an output to an input
     real_modes: float = 1.0  # weight of the phase of the modes beside the χ² of the columns
     known: float = 100.0  # χ² of a mode at which it has half of that weight
@@ -47,6 +46,11 @@ class DelaysSettings:
 DELAYS = DelaysSettings()
 DELAY_SEARCH = "search for delays of the inputs"
 FRACTIONS = np.linspace(0.0, 1.0, 401)  # of a sample
+HOLD_IN_WORDS = {
+    "zero": "held between samples",
+    "first": "straight between samples",
+    "band-limited": "band-limited, as behind an anti-alias filter",
+}
 
 
 def select_with_delays(
@@ -60,10 +64,10 @@ def select_with_delays(
     time_limit, first = options.time_limit, _first_lags(data.records)
     if data.hold == "band-limited":
         return _select_with_band_limited_delays(data, first, options, strongest)
-    whole = np.maximum(first - (0 if data.hold == "first" else 1), 0)
-    without_delay: tuple[KnownInputs, SelectedModes] | None = None
     if data.hold == "zero" and not first.any():
         return select(data, options, strongest)
+    whole = np.maximum(first - (0 if data.hold == "first" else 1), 0)
+    without_delay: tuple[KnownInputs, SelectedModes] | None = None
     delayed = data.delayed_by(whole, any_fraction=True)
     strongest = select_strongest(delayed, options)
     if not whole.any():
@@ -161,11 +165,7 @@ def _whole_and_fraction(data: KnownInputs, fit: Fit, whole: Floats, time_limit: 
 
 
 def _first_lags(records: Sequence[Record]) -> np.ndarray:
-    """Lag in samples of the first significant response to each input, (n_inputs,); 0 where the records are too short.
-
-    Args:
-        records: of the same inputs and outputs at one rate.
-    """
+    """Lag in samples of the first significant response to each input, (n_inputs,); 0 where records are too short."""
     m, q = records[0].n_outputs, records[0].n_inputs
     rows = sum(record.n_samples for record in records)
     moved = n_moving(records)  # impulses are too short to show lags
@@ -184,11 +184,11 @@ def _first_lags(records: Sequence[Record]) -> np.ndarray:
             gram += x @ x.T
             moment += x @ present.T
             squares += present @ present.T
-    gram[np.diag_indices_from(gram)] += DELAYS.floor**2 * np.diag(gram) + 1e-300
+    gram[np.diag_indices_from(gram)] += ORDER.floor**2 * np.diag(gram) + 1e-300
     scale = 1.0 / np.sqrt(np.diag(gram))
     factor = cho_factor(gram * np.outer(scale, scale))
     coefficients = scale[:, None] * cho_solve(factor, scale[:, None] * moment)
-    residual_squares = squares - coefficients.T @ moment + DELAYS.floor**2 * np.diag(np.diag(squares))
+    residual_squares = squares - coefficients.T @ moment + ORDER.floor**2 * np.diag(np.diag(squares))
     variance = np.diag(cho_solve(factor, np.eye(size))) * scale**2
     b, free = coefficients[lags * m :], max(rows - lags * len(records) - size, 1)
     statistic = np.einsum("kj,kj->k", b, np.linalg.solve(residual_squares / free, b.T).T) / variance[lags * m :]
@@ -197,12 +197,7 @@ def _first_lags(records: Sequence[Record]) -> np.ndarray:
 
 
 def _act_later(data: KnownInputs, fit: Fit) -> np.ndarray:
-    """Whether each input acts later than in `data`, (n_inputs,): its column u_k-1 is significant.
-
-    Args:
-        data: with `any_fraction`.
-        fit: to it.
-    """
+    """Whether each input acts later than in `data`, of `any_fraction`, (n_inputs,): its column u_k-1 is significant."""
     columns, noise = _column_coefficients(data, fit)
     limit = chi2.isf(FALSE_ALARM / data.n_inputs, columns.shape[2])
     return np.asarray(((columns[1] / noise[1]) ** 2).sum(axis=1) > limit)
@@ -218,12 +213,7 @@ def _column_coefficients(data: KnownInputs, fit: Fit) -> tuple[np.ndarray, np.nd
 
 
 def _fractions(data: KnownInputs, fit: Fit) -> Floats:
-    """Fraction of a sample by which each input acts later than in `data`, (n_inputs,), in [0, 1]; 0 where it does not.
-
-    Args:
-        data: with `any_fraction`.
-        fit: to it.
-    """
+    """Fraction of a sample by which each input acts later than in `data`, of `any_fraction`, (n_inputs,)."""
     q = data.n_inputs
     columns, noise = _column_coefficients(data, fit)
     phase, weight_of_phase = _phases(data, fit)
@@ -267,7 +257,9 @@ def _direct_coefficients(pole: complex, dt: float, fraction: float, hold: str) -
 def _with_free_fraction(data: KnownInputs, fit: Fit, delays: Floats, time_limit: TimeLimit) -> tuple[KnownInputs, Fit]:
     """The data with inputs delayed by whole samples and any fraction, and a fit just precise enough for decisions."""
     other = data.delayed_by(delays, any_fraction=True)
-    return other, settled(other, _for_other_delays(other, data, fit), SELECTION.few_steps, time_limit, ORDER.decided)
+    return other, settled(
+        other, _for_other_delays(other, data, fit), SELECTION.few_steps, time_limit, SELECTION.decided
+    )
 
 
 def _for_other_delays(other: KnownInputs, data: KnownInputs, fit: Fit) -> Fit:
@@ -282,3 +274,39 @@ def delay_remarks(data: KnownInputs) -> tuple[str, ...]:
     names = data.records[0].input_names
     late = [f"{names[i]} {d:.2f} samples ({d * data.dt:.3g} s)" for i, d in enumerate(data.delays) if d > 0]
     return (f"inputs act late, by {', '.join(late)}: the model has these delays",) if late else ()
+
+
+def hold_remarks(data: KnownInputs, fit: Fit, threshold: float, time_limit: TimeLimit) -> tuple[str, ...]:
+    """A remark where another course of the inputs between samples is likelier, by the threshold of twice the
+    log-likelihood ratio.
+
+    The same modes are fitted with the same noise spectrum and as many parameters for each hold. With a direct term,
+    zero- and first-order hold give the same outputs with other residues, so these two cannot be distinguished. The
+    error of the residues by a false hold does not depend on the noise: a band-limited input taken for a first-order
+    hold gives each residue 1/sinc²(f Δt) times its true size.
+    """
+    costs: dict[str, float] = {}
+    for hold in HOLDS:
+        if hold == data.hold or (data.has_direct and "band-limited" not in (hold, data.hold)):
+            continue
+        # the delay may be an artefact of the false hold
+        whole = np.floor(data.delays)
+        for delays in np.unique([data.delays, whole, np.maximum(whole - 1.0, 0.0)], axis=0):
+            if time_limit.spent("check of how inputs run between samples"):
+                return ()
+            other = replace(data, hold=hold).delayed_by(delays)
+            try:
+                start = projected(other, fit.poles, fit.participation)
+                refitted = settled(other, start, SELECTION.few_steps, time_limit, SELECTION.decided)
+            except np.linalg.LinAlgError:
+                continue
+            # a fractional delay has a row fewer
+            cost = other.cost(refitted) * len(fit.residual) / len(refitted.residual)
+            costs[hold] = min(cost, costs.get(hold, np.inf))
+    best = min(costs, key=lambda hold: costs[hold], default=data.hold)
+    if best == data.hold or costs[best] > data.cost(fit) - threshold:
+        return ()
+    return (
+        f"the records show inputs {HOLD_IN_WORDS[best]}, not {HOLD_IN_WORDS[data.hold]} as input_hold={data.hold!r}"
+        f" says: residues and modal masses are wrong, the more the higher the mode; give input_hold={best!r}",
+    )

@@ -58,17 +58,11 @@ INPUT_NOISE = InputNoiseSettings()
 
 @dataclass(frozen=True)
 class InputNoise:
-    """White noise of each input, and autoregressive noise of each output's sensor.
+    """White noise of each input, and autoregressive noise of each output's sensor."""
 
-    Attributes:
-        inputs: (n_inputs,) standard deviation.
-        innovations: (n_outputs,) standard deviation of the white noise that drives that of the sensor.
-        filters: of each output, the prediction error filter [1, -a_1, ...] of that noise.
-    """
-
-    inputs: Floats
-    innovations: Floats
-    filters: tuple[Floats, ...]
+    inputs: Floats  # (n_inputs,) standard deviation
+    innovations: Floats  # (n_outputs,) standard deviation of the white noise that drives that of the sensor
+    filters: tuple[Floats, ...]  # of each output, the prediction error filter [1, -a_1, ...] of that noise
 
     def sensors_at(self, phase: Floats) -> Floats:
         """Standard deviation of the sensors' noise at the phases ωΔt (n,): (n_outputs, n)."""
@@ -76,12 +70,8 @@ class InputNoise:
 
 
 def input_noise(data: KnownInputs, fit: Fit) -> InputNoise | None:
-    """The noise of the inputs, estimated from the residual; None where the inputs may be exact.
-
-    Args:
-        data: lines of equal weight.
-        fit: of the modes that are sure.
-    """
+    """The noise of the inputs, estimated from the residual of the modes that are sure, in lines of equal weight; None
+    where the inputs may be exact."""
     if fit.poles.size < 2 or not _noise_bound(data.records).any():  # a single mode does not distinguish input noise
         return None
     lines, gain = _residual_spectra(data, fit)
@@ -134,8 +124,7 @@ def _noise_bound(records: Sequence[Record]) -> Floats:
 
 def _frequencies(data: KnownInputs) -> Floats:
     """rad/s of the lines of all records, (n_lines,)."""
-    each = [np.linspace(0.0, data.highest, rows.stop - rows.start, endpoint=False) for rows in data.rows]
-    return np.concatenate(each)
+    return np.concatenate([np.linspace(0.0, data.highest, n, endpoint=False) for n in data.lengths])
 
 
 def _by_record(data: KnownInputs, lines: Floats) -> list[Floats]:
@@ -188,11 +177,7 @@ def _likeliest_levels(power: Floats, gain: Floats, highest: Floats) -> tuple[Flo
 def with_white_noise(
     data: KnownInputs, fit: Fit, noise: InputNoise, options: SelectionOptions
 ) -> tuple[KnownInputs, Fit]:
-    """The records with the expected inputs and outputs without the noise that these leave, and the modes.
-
-    Args:
-        data, fit: as in `input_noise`.
-    """
+    """The records with the expected inputs and outputs without the noise that these leave, and the modes."""
     data = replace(data, records=[_expected_inputs(record, noise) for record in data.records], line_std=None)
     gain = _residual_spectra(data, projected(data, fit.poles, fit.participation))[1]
     std = np.sqrt(noise.sensors_at(_frequencies(data) * data.dt) ** 2 + np.tensordot(noise.inputs**2, gain, 1)).T
@@ -233,30 +218,24 @@ def _whitened(data: KnownInputs, fit: Fit, noise: InputNoise) -> KnownInputs:
 
 
 def spread_by_inputs(data: KnownInputs, fit: Fit, std: Floats, acts: Sequence[Flags]) -> Floats:
-    """Covariance of a fit due to white noise of the inputs.
+    """Covariance of a fit due to white noise of the inputs: of the free unknowns, then of the coefficients of each
+    output, one output after the other.
 
     Args:
         std: (n_inputs,) of that noise.
         acts: of each record (n_inputs, n_samples), the samples whose input is noisy.
-
-    Returns:
-        (n, n) of the free unknowns, then of the coefficients of each output, one output after the other.
     """
     phi, tangents = columns(data, fit.poles, fit.participation)
     free, bound, responses = free_parameters(fit), covariance(fit), _impulse_responses(data, fit)
     weights = row_weights(data)
     total: Floats = np.zeros((free.size + fit.coefficients.size,) * 2)
-    for rows, noisy in zip(data.rows, acts, strict=True):
-        n = rows.stop - rows.start
+    for rows, n, noisy in zip(data.rows, data.lengths, acts, strict=True):
         size = next_fast_len(n + responses.shape[2], real=True)
         spectra = _spectra(responses, size).conj()
         for i in np.flatnonzero(std):
             unknowns, along, effects = np.zeros((n, free.size)), [], []
             for part, outputs in fit.outputs():
-                jacobian, rest = (
-                    tangent_weights(fit, part)[:, free],
-                    tangents[rows] - phi[rows] @ part.tilt,
-                )
+                jacobian, rest = (tangent_weights(fit, part)[:, free], tangents[rows] - phi[rows] @ part.tilt)
                 for k, j in enumerate(range(outputs.start, outputs.stop)):
                     square = weights[rows, j, None] ** 2 if len(weights) > 1 else 1.0
                     terms = data.samples(square * np.hstack([rest, phi[rows]]))
@@ -272,10 +251,7 @@ def spread_by_inputs(data: KnownInputs, fit: Fit, std: Floats, acts: Sequence[Fl
 
 
 def noise_outside_impacts(logged: Sequence[Record], windowed: Sequence[Record]) -> Floats:
-    """Standard deviation of the noise that force windows removed from each input, (n_inputs,).
-
-    The impacts contain as much.
-    """
+    """Standard deviation of the noise that force windows removed from each input, (n_inputs,): impacts hold it too."""
     squares, counts = np.zeros((2, logged[0].n_inputs))
     for before, after in zip(logged, windowed, strict=True):
         windowed_inputs = (before.inputs != after.inputs).any(axis=1)[:, None]

@@ -67,39 +67,25 @@ class KnownInputs:
 
     Rows are the samples, one record after another, or the lines of each record: with `line_std` these over their noise,
     and of long records with held inputs without it, since lines of their responses take less time (`lines_of_poles`).
-
-    Attributes:
-        records: with the same inputs and outputs at one rate.
-        at_rest, hold, feedthrough: as in `identify_driven`; hold is its `input_hold`.
-        delays: (n_inputs,) of each input, samples; none unless given.
-        any_fraction: whether each input has a further, unknown delay of a fraction of a sample: it then has two
-            columns, the input at its whole delay and a sample later.
-        drift: degree of the polynomials of time that each output of each record holds; 0, a constant, unless given.
-        line_std: relative noise of each line, one (n_rows, n_outputs) a record, of unit rms over all; without it all
-            have equal weight.
-        beside: (n_samples, n_columns) of all records, fixed columns beside those of the inputs and the constants.
-        changing: poles of the time- or amplitude-dependent modes whose columns `beside` holds.
-        distorted: poles of nonlinear modes; no further mode is searched near these.
-        free: poles identified from the free decay within the records, to start from where some are distorted.
-        measured: the records as measured, where the noise of their inputs was whitened.
-        clock: ε of the clock of the outputs (`output_clock`), by which they were resampled; 0 where they were not.
     """
 
-    records: Sequence[Record]
+    records: Sequence[Record]  # with the same inputs and outputs at one rate
     _: KW_ONLY
-    at_rest: bool
+    at_rest: bool  # as in `identify_driven`, with the next two; `hold` is its `input_hold`
     hold: str
     feedthrough: bool
-    delays: np.ndarray = field(default_factory=lambda: np.zeros(1))
-    any_fraction: bool = False
-    drift: int = 0
-    line_std: Sequence[np.ndarray] | None = None
-    beside: Floats | None = None
-    changing: tuple[complex, ...] = ()
-    distorted: tuple[complex, ...] = ()
-    free: tuple[complex, ...] = ()
-    measured: Sequence[Record] | None = None
-    clock: float = 0.0
+    delays: np.ndarray = field(default_factory=lambda: np.zeros(1))  # (n_inputs,) samples
+    any_fraction: bool = (
+        False  # unknown fractions of a sample beyond `delays`: each input has the columns u_k and u_k-1
+    )
+    drift: int = 0  # degree of the polynomials of time that each output of each record holds
+    line_std: Sequence[np.ndarray] | None = None  # relative noise of lines, (n_rows, n_outputs) a record, of unit rms
+    beside: Floats | None = None  # (n_samples, n_columns) of all records, further fixed columns
+    changing: tuple[complex, ...] = ()  # poles of the time- or amplitude-dependent modes whose columns `beside` holds
+    distorted: tuple[complex, ...] = ()  # poles of nonlinear modes; no further mode is searched near these
+    free: tuple[complex, ...] = ()  # poles of the free decay within the records, to start from where some are distorted
+    measured: Sequence[Record] | None = None  # the records as measured, where the noise of their inputs was whitened
+    clock: float = 0.0  # ε of the clock of the outputs (`output_clock`), by which they were resampled
 
     def __post_init__(self) -> None:
         records = self.records
@@ -109,33 +95,29 @@ class KnownInputs:
         self.whole = np.floor(self.delays).astype(int)
         self.fraction = self.delays - self.whole
         # Inputs before the record are unknown unless it begins at rest: the samples that need these are left out.
-        late = bool(self.any_fraction or self.fraction.any())
-        self.first = 0 if self.at_rest else int(self.whole.max()) + late
+        self.first = 0 if self.at_rest else int(self.whole.max()) + bool(self.any_fraction or self.fraction.any())
         self.driving, self.spectra = [record.inputs for record in records], [np.zeros((0, 0), complex)] * len(records)
         if self.hold == "band-limited":
             if self.fraction.any():
                 self.driving = [later(u, self.fraction) for u in self.driving]
                 self.fraction = np.zeros_like(self.delays)
             self.spectra = [spectrum_of(u) for u in self.driving]
-        lengths = [record.n_samples - self.first for record in records]
-        ends = np.cumsum([0, *lengths])
+        self.lengths = [record.n_samples - self.first for record in records]
+        ends = np.cumsum([0, *self.lengths])
         self.rows = [slice(a, b) for a, b in zip(ends, ends[1:])]
 
         # a delayed first-order hold has a corner at the first sample of the input, which no closed form has
         held = not self.fraction.any() and (self.hold == "zero" or (self.hold == "first" and not self.whole.any()))
         coloured = self.line_std is not None and any(np.ptp(size, axis=0).any() for size in self.line_std)
-        self.rows_are_lines = coloured or (held and sum(lengths) >= MANY_ROWS)
-        self.of_poles = (
-            [LinesOfPoles(self._shifted(u), self.first, self.dt, self.at_rest) for u in self.driving]
-            if held and self.rows_are_lines
-            else []
-        )
+        self.rows_are_lines = coloured or (held and sum(self.lengths) >= MANY_ROWS)
+        driving = self.driving if held and self.rows_are_lines else []
+        self.of_poles = [LinesOfPoles(self._shifted(u), self.first, self.dt, self.at_rest) for u in driving]
         self.weights = None if self.line_std is None else 1.0 / np.vstack(self.line_std)
         self.values = self._rows(np.vstack(self._measured()))
         if self.weights is not None:
             self.values = self.values * self.weights
 
-        fixed = [block_diag(*(legvander(np.linspace(-1.0, 1.0, length), self.drift) for length in lengths))]
+        fixed = [block_diag(*(legvander(np.linspace(-1.0, 1.0, length), self.drift) for length in self.lengths))]
         direct = np.vstack([self.direct(k).T[self.first :] for k in range(len(records))])
         # A constant input is collinear with the offset of each output.
         self.has_direct = (self.feedthrough or self.any_fraction) and bool(np.ptp(direct, axis=0).all())
@@ -146,13 +128,14 @@ class KnownInputs:
             fixed.append(np.vstack([self.beside[a + self.first : b] for a, b in zip(starts, starts[1:])]))
         self.fixed = self._rows(np.hstack(fixed))
 
-        span = max(lengths) * self.dt
+        longest = max(self.lengths)
+        span = longest * self.dt
         self.resolution = 2.0 * np.pi / span
         self.highest = self.nyquist = np.pi / self.dt
-        self.size = next_fast_len(2 * max(lengths))
+        self.size = next_fast_len(2 * longest)
         fastest = max(0.1 * np.pi / self.dt, 2.0 / span)
         self.rates = np.geomspace(0.5 / span, fastest, max(int(np.log(fastest * span)) + 2, 3))
-        self.cells = self.rates.size * max(lengths)
+        self.cells = self.rates.size * longest
         self._last = local()
         self._kept: dict[float, list[Floats]] = {}
 
@@ -173,8 +156,8 @@ class KnownInputs:
         delayed = replace(self, delays=delays, any_fraction=any_fraction, line_std=None)
         if self.line_std is None:
             return delayed
-        lengths = [rows.stop - rows.start for rows in delayed.rows]
-        return replace(delayed, line_std=[_resampled(std, n) for std, n in zip(self.line_std, lengths, strict=True)])
+        each = zip(self.line_std, delayed.lengths, strict=True)
+        return replace(delayed, line_std=[_resampled(std, n) for std, n in each])
 
     def apart(self, fit: Fit) -> "KnownInputs | None":
         """Combinations of outputs with independent residuals of unit variance, lines of equal weight.
@@ -226,10 +209,8 @@ class KnownInputs:
         return log_sizes + len(fit.residual) * float(np.log((fit.residual**2).sum(axis=0)).sum())
 
     def noise_ratios(self, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-        """κ, noise power over its mean: near each mode and along each fixed column.
-
-        (n_outputs, n_modes) and (n_fixed, n_outputs). Records are weighted by the energy of the mode or column in each.
-        """
+        """κ, noise power over its mean: near each mode, (n_outputs, n_modes), and along each fixed column, (n_fixed,
+        n_outputs). Records are weighted by the energy of the mode or column in each."""
         std = np.sqrt(variances(*self._squares(fit)))
         each = zip(fit.poles, fit.participation)
         coordinates = [modal_coordinate(self.responses(pole), l_r) for pole, l_r in each]
@@ -252,7 +233,7 @@ class KnownInputs:
         return np.maximum(squares, 1e-28 * squares.max() + 1e-300), self._free(fit)
 
     def _free(self, fit: Fit) -> np.ndarray:
-        n_rows = np.array([rows.stop - rows.start for rows in self.rows])
+        n_rows = np.array(self.lengths)
         n_parameters = fit.coefficients.shape[0] + free_parameters(fit).size / self.values.shape[1]
         return np.asarray(np.maximum(n_rows * (1.0 - n_parameters / n_rows.sum()), 1.0))
 
@@ -359,11 +340,8 @@ class KnownInputs:
         return self._rows(slopes.real[:, None])[:, 0], self._rows(slopes.imag[:, None])[:, 0]
 
     def _of_pole(self, pole: complex) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """For each record: z of each input from rest, derivative of its forcing, and decay of a unit initial state.
-
-        The derivative of c_0 u_k + c_1 u_k+1 is by λ; (n_inputs, n_samples) twice, (n_samples,). Cached for the last
-        pole of each thread.
-        """
+        """For each record: z of each input from rest, derivative of its forcing, c_0 u_k + c_1 u_k+1, by λ,
+        (n_inputs, n_samples) each, and decay of a unit initial state. Cached for the last pole of each thread."""
         if getattr(self._last, "pole", None) != pole:
             self._last.pole = pole
             self._last.each = [
@@ -393,9 +371,7 @@ class KnownInputs:
     ) -> np.ndarray:
         """z of each input, delayed by its fraction of a sample; its derivative by λ instead where `slope` is given.
 
-        Args:
-            inputs: (n_inputs, n_samples).
-            z, slope: (n_inputs, n_samples) without that delay, and the derivative of z by λ.
+        From z and slope, its derivative by λ, without that delay, (n_inputs, n_samples).
         """
         delayed = (z if slope is None else slope).copy()
         for i in np.flatnonzero(self.fraction):
@@ -449,10 +425,8 @@ class KnownInputs:
         return list(filter(np.any, excitations))
 
     def _powers(self, rate: float, decay: Floats, autocorrelations: list[Floats]) -> list[Floats]:
-        """Power of the response of a pole of a rate of decay at each line, to each excitation, weighted as each output.
-
-        (n_outputs, n_lines), or (1, n_lines) where all have equal weight; then kept for the next search.
-        """
+        """Power of the response of a pole of a rate of decay at each line, to each excitation, weighted as each output,
+        (n_outputs, n_lines), or (1, n_lines) where all have equal weight; then kept for the next search."""
         powers = []
         for autocorrelation in autocorrelations:
             power = 2.0 * np.fft.rfft(autocorrelation * decay, self.size).real - autocorrelation[:, :1]
@@ -475,7 +449,7 @@ class KnownInputs:
         return found
 
     def noise_ratio(self, residual: np.ndarray, pole: complex) -> float:
-        longest = max(self.rows, key=lambda rows: rows.stop - rows.start)
+        longest = self.rows[int(np.argmax(self.lengths))]
         power = (np.abs(np.fft.rfft(self.samples(residual[longest]), axis=0)[1:]) ** 2).mean(axis=1)
         nearest = round(pole.imag / self.resolution) - 1
         return local_noise_ratio(power, nearest, SELECTION.noise_bins)

@@ -27,7 +27,6 @@ class LinesOfPoles:
     Args:
         inputs: (n_inputs, n_samples) of the record from its first sample, zero before.
         first: the sample at which the transformed part begins.
-        dt: sample time, s.
         at_rest: whether there is no initial state.
     """
 
@@ -50,27 +49,13 @@ class LinesOfPoles:
         return bool(abs(1.0 - np.exp(pole * self.dt - 1j * line)) < LEAST_DISTANCE * spacing)
 
     def tangents(
-        self,
-        pole: complex,
-        held: Sources,
-        rows: np.ndarray,
-        participation: Complexes,
-        real: Floats,
-        imaginary: Floats,
+        self, pole: complex, held: Sources, rows: np.ndarray, participation: Complexes, real: Floats, imaginary: Floats
     ) -> None:
         """Write the response to each input, and to the initial state, into these rows of (n_rows, n_lines).
 
         Row 0 becomes the derivative by the pole of their sum with participation factors. Responses alone take as long.
-
-        Args:
-            held: (c_0, c_1), and their derivatives by the pole.
+        `held` are (c_0, c_1), and their derivatives by the pole.
         """
-        factors, ends = self._factors(pole, held)
-        real[0] = imaginary[0] = 0.0
-        _lines(self.turn, self.half, self.spectra, factors, ends, participation, rows, real, imaginary)
-
-    def _factors(self, pole: complex, held: Sources) -> tuple[Complexes, Complexes]:
-        """m, c_0, c_1 and their derivatives, and what `_ends` gives."""
         m, n = np.exp(pole * self.dt), self.inputs.shape[1]
         factors = np.array([m, *held[0], self.dt * m, *held[1]], complex)
         # what acts before is forgotten to rounding by the last sample
@@ -79,7 +64,8 @@ class LinesOfPoles:
         if not self.at_rest:
             before, after = m**self.first, -(m**n)
             ends = np.vstack([ends, [before, after, self.first * self.dt * before, n * self.dt * after]])
-        return factors, ends
+        real[0] = imaginary[0] = 0.0
+        _lines(self.turn, self.half, self.spectra, factors, ends, participation, rows, real, imaginary)
 
 
 def _parts(values: Complexes) -> Floats:

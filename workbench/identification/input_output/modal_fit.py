@@ -11,7 +11,7 @@ gives the Gauss-Newton matrix H; H^-1 in the noise of the outputs is the Cramér
 each mode is held at 1: the shape carries its scale.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -36,51 +36,33 @@ LEAST_INDEPENDENT_OF_PRODUCTS = 1e-3
 
 
 class Measurement(Protocol):
-    """A measurement to which modes are fitted.
+    """A measurement to which modes are fitted."""
 
-    Attributes:
-        values: (n_rows, n_outputs) real readings, divided by their relative noise where `weights` is given.
-        fixed: (n_rows, n_fixed) columns v_f.
-        weights: (n_rows, n_outputs) inverse relative noise, or None where it is the same in all rows of an output.
-        resolution: 2π over the duration, rad/s.
-        highest: rad/s, beyond which no pole is searched.
-        nyquist: rad/s, half of the sample rate; inf of response functions.
-        n_inputs: number of excitations that are inputs; the others are initial states.
-        cells: number of poles that could be distinguished, for the chance of a false alarm.
-        distorted: poles of nonlinear modes; no further mode is searched near these.
-        free: poles identified from a free decay within the record, given where some of them are distorted.
-    """
-
-    values: np.ndarray
-    fixed: np.ndarray
-    weights: np.ndarray | None
-    resolution: float
-    highest: float
-    nyquist: float
-    n_inputs: int
-    cells: int
-    distorted: tuple[complex, ...]
-    free: tuple[complex, ...]
+    values: np.ndarray  # (n_rows, n_outputs) real readings, divided by their relative noise where `weights` is given
+    fixed: np.ndarray  # (n_rows, n_fixed) columns v_f
+    weights: np.ndarray | None  # (n_rows, n_outputs) inverse relative noise; None where all rows have the same
+    resolution: float  # 2π over the duration, rad/s
+    highest: float  # rad/s, beyond which no pole is searched
+    nyquist: float  # rad/s, half of the sample rate; inf of response functions
+    n_inputs: int  # number of excitations that are inputs; the others are initial states
+    cells: int  # number of poles that could be distinguished, for the chance of a false alarm
+    distorted: tuple[complex, ...]  # poles of nonlinear modes; no further mode is searched near these
+    free: tuple[complex, ...]  # poles of a free decay within the record, given where some of them are distorted
 
     def responses(self, pole: complex) -> Pair:
         """Real and imaginary parts of x_p(λ), (n_rows, n_excitations) each."""
-        ...
 
     def slopes(self, pole: complex, participation: np.ndarray) -> Pair:
         """∂/∂λ of Σ_p l_p x_p(λ), (n_rows,) each."""
-        ...
 
     def tangents(self, pole: complex, participation: np.ndarray, real: np.ndarray, imaginary: np.ndarray) -> None:
         """Write `slopes`, then `responses`, into columns (n_rows, 1 + n_excitations)."""
-        ...
 
     def candidates(self, residual: np.ndarray) -> np.ndarray:
         """Poles to try, (n_candidates,), from the residual in units of the noise."""
-        ...
 
     def noise_ratio(self, residual: np.ndarray, pole: complex) -> float:
         """Noise power about a pole over its mean, at least 1."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,9 +133,15 @@ def projected(data: Measurement, poles: np.ndarray, participation: np.ndarray, i
     phi, t = x @ combined, x[:, : x.shape[1] - data.fixed.shape[1]]
     if data.weights is None:
         return Fit(poles, participation, (_part(phi, t, data.values),))
-    each = data.weights.T[:, :, None]
-    parts = [_part(w * phi, w * t, y[:, None]) for w, y in zip(each, data.values.T)]
-    return Fit(poles, participation, tuple(parts))
+    return Fit(poles, participation, tuple(_part(w * phi, w * t, y) for w, y in weighted_outputs(data)))
+
+
+def weighted_outputs(data: Measurement) -> Iterator[Pair]:
+    """Weights (n_rows, 1) and readings (n_rows, 1) of each output; 1 and those of all where rows have equal weight."""
+    if data.weights is None:
+        yield np.ones((1, 1)), data.values
+    else:
+        yield from zip(data.weights.T[:, :, None], data.values.T[:, :, None], strict=True)
 
 
 def row_weights(data: Measurement, rows: slice | None = None) -> Floats:
@@ -198,9 +186,7 @@ def regressors(
 def changes_of(a: np.ndarray, tangents: Pair) -> np.ndarray:
     """Changes of an output by the real, then by the imaginary parts of changes of unknowns, (n_rows, 2 n_unknowns).
 
-    Args:
-        a: (n_unknowns,) amplitude at the output of the mode of each unknown.
-        tangents: real and imaginary parts of ∂z by each unknown, (n_rows, n_unknowns) each.
+    From the amplitude (n_unknowns,) at the output of the mode of each unknown, and ∂z by each, (n_rows, n_unknowns).
     """
     real, imaginary = tangents
     return np.hstack([a.real * real - a.imag * imaginary, -a.imag * real - a.real * imaginary])
@@ -219,17 +205,9 @@ def combinations(participation: np.ndarray, n_fixed: int) -> np.ndarray:
 
 
 def _parts_by_products(data: Measurement, x: np.ndarray, combined: np.ndarray) -> Iterator[Part]:
-    """The projections from the products of X = [T, V]; Φ = X K.
-
-    Raises:
-        LinAlgError: columns too nearly dependent for that.
-    """
+    """The projections from the products of X = [T, V]; Φ = X K. LinAlgError where columns are too nearly dependent."""
     t = slice(0, x.shape[1] - data.fixed.shape[1])
-    if data.weights is None:
-        each: Iterable[Pair] = [(np.ones((1, 1)), data.values)]
-    else:
-        each = zip(data.weights.T[:, :, None], data.values.T[:, :, None], strict=True)
-    for weight, y in each:
+    for weight, y in weighted_outputs(data):
         products, moments = products_of(x, weight, y)
         with_columns = combined.T @ products
         of_columns = with_columns @ combined
@@ -246,11 +224,8 @@ def _parts_by_products(data: Measurement, x: np.ndarray, combined: np.ndarray) -
 
 
 def products_of(x: Floats, weight: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """X^T W² X of columns X (n_rows, n_columns), and X^T W y of weighted readings (n_rows, n_outputs).
-
-    Args:
-        weight: (n_rows, 1), or (1, 1) for rows of equal weight.
-    """
+    """X^T W² X of columns X (n_rows, n_columns), and X^T W y of weighted readings (n_rows, n_outputs); weights are
+    (n_rows, 1), or (1, 1) for rows of equal weight."""
 
     def of_rows(rows: slice) -> tuple[Floats, Floats]:
         block = x[rows] if len(weight) == 1 else weight[rows] * x[rows]
@@ -337,10 +312,7 @@ def scaled_vectors(fit: Fit, kept: np.ndarray, derivative: np.ndarray) -> Pair:
     """Shapes of displacement, (n_outputs, n_kept), largest entry 1, and participation factors, (n_kept, n_excitations).
 
     y = Re Σ a z and H = Σ a l / 2 (s - λ) + conjugate: the participation factors take up the scale of the shape.
-
-    Args:
-        kept: (n_kept,) indices of the modes.
-        derivative: (n_outputs, 1) order of the time derivative of displacement that each output measures.
+    `derivative` (n_outputs, 1) is the order of the time derivative of displacement that each output measures.
     """
     displacements = fit.amplitudes[:, kept] / fit.poles[kept] ** derivative
     shapes = normalised_shapes(displacements) if kept.size else displacements
@@ -357,10 +329,8 @@ def free_parameters(fit: Fit) -> np.ndarray:
 
 
 def tangent_weights(fit: Fit, part: Part) -> np.ndarray:
-    """Coefficients of the tangents in the change of each output with each unknown.
-
-    (n_tangents, n_unknowns, n_outputs), for the outputs of one part.
-    """
+    """Coefficients of the tangents in the change of each output of one part with each unknown, (n_tangents, n_unknowns,
+    n_outputs)."""
     n, q = fit.poles.size, fit.participation.shape[1] + 1
     alpha = np.repeat(part.coefficients[:n], q, axis=0)
     beta = np.repeat(part.coefficients[n : 2 * n], q, axis=0)
@@ -396,12 +366,9 @@ def search(
     negligible: float = FIT.negligible,
     is_vain: Callable[[Fit], bool] = lambda fit: False,
 ) -> Fit:
-    """Least-squares fit over poles and participation factors, outputs in units of `noise`.
+    """Least-squares fit over poles and participation factors, outputs in units of `noise`, from a fit of the same data.
 
-    Args:
-        fit: to start from, of the same data.
-        negligible: expected decrease of χ² per value below which the search ends.
-        is_vain: whether a fit ends the search, since what follows from it is of no use.
+    It ends where the expected decrease of χ² per value is negligible, or a fit `is_vain`.
     """
     held = fit.participation[np.arange(fit.poles.size), np.argmax(_strength(fit), axis=1)]
     if (held != 1.0).any():

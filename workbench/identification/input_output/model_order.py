@@ -39,7 +39,6 @@ class OrderSettings:
 
     most_weak: int = 3  # consecutive candidates below the threshold, after which the search ends
     steps: int = 20  # of the fit by which a mode enters
-    decided: float = 0.1  # χ² of each output, expected of a further step, below which such a fit ends
     enter: float = 0.5  # of the threshold, at which a candidate is fitted: its participation factors are approximate
     distinct: float = 10.0  # times the threshold: two close modes, each above it, are not tested for removal
     apart: float = 10.0  # decay rates: a candidate nearer to a mode is fitted with it, not alone
@@ -56,13 +55,7 @@ ORDER = OrderSettings()
 
 @dataclass(frozen=True)
 class SelectionOptions:
-    """Options of a selection of modes.
-
-    Attributes:
-        max_modes: largest number of modes.
-        false_alarm: probability that noise alone is taken for a mode.
-        time_limit: of time.
-    """
+    """Options of a selection of modes: the largest number, and the probability that noise alone is taken for one."""
 
     max_modes: int
     false_alarm: float = FALSE_ALARM
@@ -74,21 +67,13 @@ Scored = tuple[float, np.ndarray, complex]  # gain, participation factors and po
 
 @dataclass(frozen=True, eq=False)
 class SelectedModes:
-    """The selected modes.
-
-    Attributes:
-        fit: of all selected modes.
-        statistic: (n_modes,) χ² of each mode.
-        limit: threshold of this χ², exceeded by noise alone with the chance of a false alarm.
-        full: whether the selection stopped at the maximum number of modes.
-        distorted: poles of nonlinear modes, near which modes that do not predict held-out data were removed.
-    """
+    """The selected modes."""
 
     fit: Fit
-    statistic: np.ndarray
-    limit: float
-    full: bool
-    distorted: tuple[complex, ...] = ()
+    statistic: np.ndarray  # (n_modes,) χ² of each mode
+    limit: float  # threshold of this χ², exceeded by noise alone with the chance of a false alarm
+    full: bool  # whether the selection stopped at the maximum number of modes
+    distorted: tuple[complex, ...] = ()  # nonlinear modes, near which modes that do not predict others were removed
 
     def refitted(self, fit: Fit) -> "SelectedModes":
         """The same selection with another fit, and the statistic of each mode in that fit."""
@@ -100,9 +85,7 @@ def select_modes(
 ) -> SelectedModes:
     """The modes whose likelihood ratio exceeds the threshold for noise, by forward and backward stepwise selection.
 
-    Args:
-        start: modes to start from; none unless given.
-        is_tested: whether each mode of the start was tested in a selection from the same measurement.
+    It may start from modes; `is_tested` where each of these was tested in a selection from the same measurement.
     """
     problem = _Modes(data, options)
     selection = OrderSelection(
@@ -118,8 +101,8 @@ def select_modes(
             pass  # modes that cannot be distinguished: search without a start
     fit = selection.select(fit)
     order = np.argsort(np.abs(fit.poles))
-    sorted_already = (np.diff(order) == 1).all()
-    ordered = fit if sorted_already else replace(only(data, fit, order), converged=fit.converged, steps=fit.steps)
+    is_sorted = (np.diff(order) == 1).all()
+    ordered = fit if is_sorted else replace(only(data, fit, order), converged=fit.converged, steps=fit.steps)
     return SelectedModes(ordered, statistic_of_each(fit)[order], problem.limit, selection.full)
 
 
@@ -144,9 +127,8 @@ def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float) -> Fi
         spreads.append(np.linalg.inv(gram))
         coefficients.append(spreads[-1] @ (moments / scale[:, None]))
         rss = ((y - weights * (columns @ (coefficients[-1] / scale[:, None]))) ** 2).sum(axis=0)
-        variances.append(
-            np.maximum(rss / max(len(columns) - columns.shape[1], 1), ORDER.floor**2 * (y**2).mean(axis=0))
-        )
+        variance = rss / max(len(columns) - columns.shape[1], 1)
+        variances.append(np.maximum(variance, ORDER.floor**2 * (y**2).mean(axis=0)))
     limit = chi2.isf(false_alarm / data.cells, size * data.values.shape[1])
     while poles.size:
         blocks = np.arange(poles.size * size).reshape(poles.size, size)
@@ -193,11 +175,8 @@ def _responses(data: Measurement, poles: np.ndarray, size: int, further: np.ndar
 def _rank_one_participation(residues: np.ndarray, norm: np.ndarray) -> np.ndarray:
     """Participation factors (n_excitations,) of the rank-one approximation of residues (2 n_excitations, n_outputs).
 
-    That of the strongest response is 1, as `modal_fit` holds it.
-
-    Args:
-        residues: real parts, then negated imaginary parts.
-        norm: (2 n_excitations,) norms of the columns they belong to.
+    Of real parts, then negated imaginary parts, and the norms of the columns they belong to. That of the strongest
+    response is 1, as `modal_fit` holds it.
     """
     half = len(residues) // 2
     size = np.maximum(np.hypot(norm[:half], norm[half:]), 1e-300)
@@ -263,7 +242,7 @@ class _Modes:
 
     def extended(self, model: Fit, candidate: tuple[complex, np.ndarray]) -> Fit:
         start = self._among_near(model, *candidate)
-        return search(self.data, start, model.noise, ORDER.steps, self.time_limit, ORDER.decided, _is_overdamped)
+        return search(self.data, start, model.noise, ORDER.steps, self.time_limit, SELECTION.decided, _is_overdamped)
 
     def _among_near(self, model: Fit, pole: complex, participation: np.ndarray) -> Fit:
         """A model and a candidate, which in a long record is first fitted to what the modes far from it leave.
@@ -285,7 +264,7 @@ class _Modes:
             at_near = np.concatenate([near[:-1], n + near[:-1]])
             left.values = model.residual + (phi @ model.coefficients[at_near]) * row_weights(data)
             start = projected(left, poles[near], factors[near])
-            fit = search(left, start, model.noise, ORDER.steps, self.time_limit, ORDER.decided, _is_overdamped)
+            fit = search(left, start, model.noise, ORDER.steps, self.time_limit, SELECTION.decided, _is_overdamped)
             if not _is_overdamped(fit) and not np.delete(are_near(fit.poles[-1]), near[:-1]).any():
                 poles[near], factors[near] = fit.poles, fit.participation
         return projected(data, poles, factors)
@@ -307,14 +286,11 @@ class _Modes:
         return settled(self.data, model, time_limit=self.time_limit)
 
     def started(self, start: Fit, times: float = 1.0) -> Fit:
-        """The start fitted, without modes that are spurious or below the threshold.
+        """The start fitted, without modes that are spurious or whose χ² is below so many times the threshold.
 
         Each pass removes the weaker half of these; a mode removed in error is found again by the selection.
-
-        Args:
-            times: factor of the threshold that the χ² of a mode must exceed.
         """
-        model = settled(self.data, start, SELECTION.few_steps, self.time_limit, ORDER.decided)
+        model = settled(self.data, start, SELECTION.few_steps, self.time_limit, SELECTION.decided)
         while model.poles.size and not self.time_limit.spent("check of each mode"):
             statistic = np.where(_spurious(self.data, model), 0.0, marginal_statistics_of(model))
             is_weak = statistic < [times * self.threshold(model, pole) for pole in model.poles]
@@ -322,11 +298,13 @@ class _Modes:
             if not removable.size:
                 break
             removed = removable[np.argsort(statistic[removable])[: (removable.size + 1) // 2]]
-            rest = np.delete(np.arange(model.poles.size), removed)
-            model = settled(
-                self.data, only(self.data, model, rest), SELECTION.few_steps, self.time_limit, ORDER.decided
-            )
+            model = self._without(model, removed)
         return self.settled(model)
+
+    def _without(self, model: Fit, modes: int | np.ndarray) -> Fit:
+        """The model without some modes, fitted just precisely enough for decisions."""
+        rest = only(self.data, model, np.delete(np.arange(model.poles.size), modes))
+        return settled(self.data, rest, SELECTION.few_steps, self.time_limit, SELECTION.decided)
 
     def suspects(self, model: Fit) -> Iterator[tuple[complex, Fit, bool]]:
         """The modes that are spurious, weak or close to another, each with the fit without it."""
@@ -339,9 +317,7 @@ class _Modes:
             threshold = self.threshold(model, pole)
             doubtful = is_close and statistic[r] < ORDER.distinct * threshold
             if spurious[r] or doubtful or statistic_of(model, r) < SELECTION.weak * threshold:
-                without = only(self.data, model, np.delete(np.arange(model.poles.size), r))
-                without = settled(self.data, without, SELECTION.few_steps, self.time_limit, ORDER.decided)
-                yield complex(pole), without, bool(spurious[r])
+                yield complex(pole), self._without(model, r), bool(spurious[r])
 
     def _is_near(self, pole: complex, rejected: list[tuple[complex, float]]) -> bool:
         return any(abs(pole.imag - o.imag) < max(self.data.resolution, 0.5 * abs(o.real)) for o, _ in rejected)
@@ -399,12 +375,8 @@ def _candidate_gains(
 ) -> list[tuple[float, np.ndarray]]:
     """Decrease of χ² by each of some further poles with unconstrained residues, and its best participation factors.
 
-    The factors are those of rank one. Only the part of its response orthogonal to the columns of the fit counts.
-
-    Args:
-        bases: orthonormal columns of the fit, see `bases_of`.
-        residual: (n_rows, n_outputs), in units of the noise.
-        poles: (n_poles,), each by itself.
+    The factors are those of rank one. Only the part of its response orthogonal to the columns of the fit counts; for
+    `bases` see `bases_of`. The residual (n_rows, n_outputs) is in units of the noise.
     """
     size = 2 * data.responses(poles[0])[0].shape[1]
     columns = _responses(data, poles, size, data.fixed[:, :0])

@@ -32,17 +32,15 @@ def noise_spectrum(
     n_modes: int,
     free: np.ndarray,
 ) -> list[np.ndarray] | None:
-    """Standard deviation of the noise at each line of each record, (n_samples, n_outputs) each, over their rms.
+    """Standard deviation of the noise at each line of each record, (n_samples, n_outputs) each, over their rms; None
+    where the noise may be white and of equal level in all records, or is rounding error.
 
     Args:
-        residuals: of each record, (n_samples, n_outputs): the residual.
+        residuals: of each record, (n_samples, n_outputs).
         outputs: of each record, the measured outputs.
-        leverage: of each record, (n_samples, n_outputs): leverage of each line, for which the residual is corrected.
+        leverage: of each line of each record, (n_samples, n_outputs), for which the residual is corrected.
         n_modes: of the fit.
         free: (n_records,) degrees of freedom of the residual.
-
-    Returns:
-        None where the noise may be white and of equal level in all records, or is rounding error.
     """
     squares = np.array([(each**2).sum(axis=0) for each in residuals])
     measured = np.array([(each**2).sum(axis=0) for each in outputs])
@@ -75,12 +73,8 @@ def alike(one: Sequence[np.ndarray] | None, other: Sequence[np.ndarray] | None) 
 
 
 def autoregression(rows: Sequence[np.ndarray], most: int = PROJECTION.order) -> tuple[np.ndarray, float]:
-    """The prediction error filter [1, -a_1, ...] of records of one noise (Burg 1967), and the BIC of its order, least.
-
-    Args:
-        rows: of each record, (n_samples,).
-        most: largest order.
-    """
+    """The prediction error filter [1, -a_1, ...] of records (n_samples,) of one noise (Burg 1967), and the BIC of its
+    order, least up to the order `most`."""
     n = sum(row.size for row in rows)
     forward, backward = list(rows), list(rows)
     best = coefficients = np.ones(1)

@@ -68,11 +68,7 @@ def output_clock(data: KnownInputs, fit: Fit) -> OutputClock:
 
 
 def on_inputs_clock(record: Record, rate: float) -> Record:
-    """The record with its outputs resampled to the inputs' clock; samples after the last output are left out.
-
-    Args:
-        rate: ε.
-    """
+    """The record with its outputs resampled to the inputs' clock, ε = `rate`, without samples after the last output."""
     n = min(record.n_samples, int((record.n_samples - 1) * (1.0 + rate)) + 1)
     outputs = spaced(record.outputs, 1.0 / (1.0 + rate), n)
     return replace(record, outputs=outputs, inputs=record.inputs[:, :n])
@@ -83,10 +79,7 @@ def on_one_clock(
 ) -> tuple[KnownInputs, Fit] | None:
     """The data with the outputs resampled to the inputs' clock, and the fit to them; None where both clocks are one.
 
-    Args:
-        data: the records as measured.
-        fit: of the modes that are sure.
-        fitted: finds these modes in other data.
+    From a fit to the records as measured of the modes that are sure; `fitted` finds these in other data.
     """
     jumps = data.hold == "zero" and (time_derivatives(data.records[0].output_channels) == 2).any()
     if jumps or not fit.poles.size:

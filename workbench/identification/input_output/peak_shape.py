@@ -41,17 +41,11 @@ PEAKS = PeaksSettings()
 
 
 class Peaks(NamedTuple):
-    """Deviation of the peak of each mode from that of one pole.
+    """Deviation of the peak of each mode from that of one pole, (n_modes,) each."""
 
-    Attributes:
-        uneven: (n_modes,) whether it is significant and not negligible.
-        scatter: (n_modes,) rms of δ, rad/s.
-        statistic: (n_modes,) χ² of the term 1 / (s - λ)³, in the noise of the fit.
-    """
-
-    uneven: np.ndarray
-    scatter: Floats
-    statistic: Floats
+    uneven: np.ndarray  # whether it is significant and not negligible
+    scatter: Floats  # rms of δ, rad/s
+    statistic: Floats  # χ² of the term 1 / (s - λ)³, in the noise of the fit
 
 
 def peaks(lines: Lines, fit: Fit) -> Peaks:
@@ -92,13 +86,7 @@ def peaks(lines: Lines, fit: Fit) -> Peaks:
 
 
 def parts_of(poles: np.ndarray, collinearity: np.ndarray, strength: np.ndarray) -> dict[int, list[int]]:
-    """The representative of each cluster, with its other members; modes in no cluster are absent.
-
-    Args:
-        poles: (n_modes,) rad/s.
-        collinearity: (n_modes,) modal phase collinearity, 1 where all points move in phase.
-        strength: (n_modes,) the strongest of a cluster represents it.
-    """
+    """The strongest mode of each cluster, with its other members, by index; modes in no cluster are absent."""
     width, overlap = np.abs(poles.real), _overlap(poles)
     remaining, clusters = list(np.argsort(-strength)), dict[int, list[int]]()
     while remaining:
@@ -116,16 +104,14 @@ def parts_of(poles: np.ndarray, collinearity: np.ndarray, strength: np.ndarray) 
 
 
 def overlap_remarks(poles: np.ndarray, n_channels: int) -> tuple[str, ...]:
-    """A remark on overlapping modes that a single pair of input and output cannot distinguish.
+    """A remark on overlapping modes, by rising frequency, that a single pair of input and output cannot distinguish.
 
-    Args:
-        poles: (n_modes,) rad/s, by rising frequency.
-        n_channels: outputs times inputs; two and more distinguish modes by their shapes.
+    With two and more channels, outputs times inputs, their shapes distinguish them.
     """
-    first, second = np.nonzero(np.triu(_overlap(poles), 1))
-    if n_channels > 1 or not first.size:
+    overlapping = np.argwhere(np.triu(_overlap(poles), 1))
+    if n_channels > 1 or not overlapping.size:
         return ()
-    pairs = ", ".join(f"{r + 1} and {s + 1}" for r, s in zip(first, second, strict=True))
+    pairs = ", ".join(f"{r + 1} and {s + 1}" for r, s in overlapping)
     return (
         f"modes {pairs} overlap: one mode that drifts or depends on amplitude looks like that to a single input and"
         " output; compare parts of the record, or measure at another place",

@@ -1,9 +1,14 @@
-"""The modes of records with known inputs: the strongest first, and all in the noise that they leave."""
+"""The modes of records with known inputs, beside a drift of the sensors: the strongest first, and all in the noise that
+they leave."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
+from scipy.stats import chi2
 
+from workbench.arrays import Floats
 from workbench.identification.input_output.fit_errors import statistic_of_each
 from workbench.identification.input_output.held_out import without_unpredictive
 from workbench.identification.input_output.input_noise import input_noise, with_white_noise
@@ -21,7 +26,8 @@ from workbench.identification.input_output.noise_spectrum import alike
 from workbench.identification.input_output.output_clock import on_one_clock
 from workbench.identification.input_output.subspace_poles import subspace_poles
 from workbench.identification.input_output.time_variance import beside_changing
-from workbench.identification.signal.searches import SELECTION, TimeLimit
+from workbench.identification.signal.searches import FALSE_ALARM, SELECTION, TimeLimit
+from workbench.records.record import Record
 
 
 @dataclass(frozen=True)
@@ -32,6 +38,10 @@ class DrivenSelectionSettings:
     noise_rounds: int = 4  # alternations between noise and modes
     decorrelation_rounds: int = 2  # selections of modes in combinations of outputs whose noise is uncorrelated
     spare_states: int = 20  # of a subspace model beyond two per mode: these fit noise
+    drift_share: float = 0.2  # of the time left, for the modes without drift, and then for those beside it
+    drift_degree: int = 3  # of the polynomials of time that represent the drift of a sensor
+    drift_lines: int = 10  # the lowest of each output after removal of a straight line
+    stands_out: float = 10.0  # times the median of these that the energy of the straight line exceeds
 
 
 DRIVEN_SELECTION = DrivenSelectionSettings()
@@ -40,11 +50,8 @@ DRIVEN_SELECTION = DrivenSelectionSettings()
 def select(
     data: KnownInputs, options: SelectionOptions, strongest: SelectedModes | None = None
 ) -> tuple[KnownInputs, SelectedModes]:
-    """The modes, estimated with the strongest first; where noise of the outputs is correlated, in combinations without.
-
-    Returns:
-        the data, weighted by their noise, and the modes.
-    """
+    """The data, weighted by their noise, and the modes, the strongest first; where noise of the outputs is correlated,
+    in combinations without."""
     time_limit = options.time_limit
     start = subspace_start(data, options) if strongest is None else strongest.fit
     start = sure_modes(data, start, options, times=1.0)  # once for all searches from there
@@ -165,11 +172,7 @@ def _alternate_with_noise(
 ) -> tuple[KnownInputs, SelectedModes]:
     """Modes and noise spectrum, estimated alternately until both settle.
 
-    Args:
-        data: known inputs and outputs.
-        selected: the modes to start from.
-        first_options: those by which `selected` was selected.
-        options: those of the selections that follow.
+    From modes selected by `first_options`; the selections that follow have `options`.
     """
     time_limit, estimation = options.time_limit, "estimation of the noise spectrum"
     linear: list[np.ndarray] = []
@@ -193,8 +196,7 @@ def _with_changing(
 ) -> tuple[KnownInputs, SelectedModes]:
     """The data with the columns of changing modes, and the modes, as long as these are likelier than close modes.
 
-    Args:
-        linear: see `changing_response.in_place_of`.
+    For `linear` see `changing_response.in_place_of`.
     """
     # With one input and output both models were compared before.
     compared = data.values.shape[1] * data.n_inputs == 1
@@ -202,9 +204,61 @@ def _with_changing(
         changing = beside_changing(data, selected.fit, selected.limit, options.time_limit, linear)
         if changing is None:
             break
-        fewer = select_modes(changing[0], options, changing[1])
+        beside, fewer = changing[0], select_modes(changing[0], options, changing[1])
         allowed = selected.limit * max(selected.fit.poles.size - fewer.fit.poles.size, 0) if compared else 0.0
-        if changing[0].cost(fewer.fit) >= data.cost(selected.fit) + allowed:
+        if beside.cost(fewer.fit) >= data.cost(selected.fit) + allowed:
             break
-        data, selected = changing[0], fewer
+        data, selected = beside, fewer
     return data, selected
+
+
+def beside_drift(
+    data: KnownInputs, options: SelectionOptions
+) -> tuple[KnownInputs, SelectedModes | None, tuple[str, ...]]:
+    """The records with polynomials of time where these are likelier, the strongest modes if searched, and a remark.
+
+    A displaced free body drifts too: its rigid body mode explains that by the inputs, and stays.
+    """
+    if not _may_drift(data.records):
+        return data, None, ()
+    drifting = replace(data, drift=DRIVEN_SELECTION.drift_degree)
+    (without, one_ended), (beside, other_ended) = (_strongest(trial, options) for trial in (data, drifting))
+    ended = one_ended or other_ended
+    threshold = float(chi2.isf(FALSE_ALARM, data.values.shape[1] * (drifting.fixed.shape[1] - data.fixed.shape[1])))
+    threshold_of_modes = without.limit * (without.fit.poles.size - beside.fit.poles.size)
+    if drifting.cost(beside.fit) + threshold >= data.cost(without.fit) + threshold_of_modes:
+        return data, None if ended else without, ()
+    drift = _range_of_drift(drifting, beside.fit)
+    k, j = np.unravel_index(int(np.argmax(drift / beside.fit.noise)), drift.shape)
+    record = data.records[int(k)]
+    in_record = f" in record {record.name!r}" if len(data.records) > 1 else ""
+    remark = f"outputs drift, {record.output_names[j]} by {drift[k, j]:.3g}{in_record}: fitted beside the modes"
+    return drifting, None if ended else beside, (remark,)
+
+
+def _strongest(data: KnownInputs, options: SelectionOptions) -> tuple[SelectedModes, bool]:
+    """The strongest modes, and whether the time for their search was up."""
+    time_limit = options.time_limit.aside(DRIVEN_SELECTION.drift_share)
+    return select_strongest(data, replace(options, time_limit=time_limit)), bool(time_limit.unfinished)
+
+
+def _range_of_drift(data: KnownInputs, fit: Fit) -> Floats:
+    """Range of the fitted polynomial of each output over each record, (n_records, n_outputs)."""
+    n_records, n_terms = len(data.records), data.drift + 1
+    first = 2 * fit.poles.size + data.fixed.shape[1] - n_terms * n_records
+    terms = fit.coefficients[first:].reshape(n_records, n_terms, -1)
+    powers = legvander(np.linspace(-1.0, 1.0, 50), data.drift)
+    return np.asarray(np.ptp(np.einsum("td,kdj->ktj", powers[:, 1:], terms[:, 1:]), axis=1))
+
+
+def _may_drift(records: Sequence[Record]) -> bool:
+    """Whether the straight line in an output exceeds its lowest frequency lines."""
+    for record in records:
+        t = np.linspace(-1.0, 1.0, record.n_samples)
+        y = record.outputs - record.outputs.mean(axis=1, keepdims=True)
+        slope = y @ t / (t @ t)
+        lines = np.fft.rfft(y - slope[:, None] * t)[:, 1 : DRIVEN_SELECTION.drift_lines + 1]
+        energy = np.abs(lines) ** 2 * 2.0 / record.n_samples
+        if (slope**2 * (t @ t) > DRIVEN_SELECTION.stands_out * np.median(energy, axis=1)).any():
+            return True
+    return False

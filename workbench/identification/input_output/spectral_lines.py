@@ -43,26 +43,16 @@ class Lines:
     """The `modal_fit.Measurement` of FRFs; `dataclasses.replace` gives changed ones.
 
     Rows are real, then imaginary parts, reference by reference.
-
-    Attributes:
-        h: (n_outputs, n_references, n_lines).
-        omega: (n_lines,) rad/s.
-        powers: of s, in the residual terms.
-        noise: standard error of each line, as `h`; the same for all unless given.
-        guessed: whether `noise` is known up to a factor only.
-        beside: (n_rows, n_columns) fixed columns beside those of the residual terms.
-        changing: of the changing modes with these columns, their pole and the rms scatter of their frequency, rad/s.
-        window_rate: 1/τ of an exponential window, as far as noise shows one.
     """
 
-    h: np.ndarray
-    omega: np.ndarray
-    powers: list[int]
-    noise: np.ndarray | None
-    guessed: bool = False
-    beside: np.ndarray | None = None
-    changing: tuple[tuple[complex, float], ...] = ()
-    window_rate: float = 0.0
+    h: np.ndarray  # (n_outputs, n_references, n_lines)
+    omega: np.ndarray  # (n_lines,) rad/s
+    powers: list[int]  # of s, in the residual terms
+    noise: np.ndarray | None  # standard error of each line, as `h`; the same for all unless given
+    guessed: bool = False  # whether `noise` is known up to a factor only
+    beside: np.ndarray | None = None  # (n_rows, n_columns) fixed columns beside those of the residual terms
+    changing: tuple[tuple[complex, float], ...] = ()  # pole and rms scatter of frequency of changing modes, rad/s
+    window_rate: float = 0.0  # 1/τ of an exponential window, as far as noise shows one
 
     def __post_init__(self) -> None:
         omega, (_, self.n_inputs, n_lines) = self.omega, self.h.shape
@@ -110,9 +100,8 @@ class Lines:
         return (real + 1j * imaginary).T.reshape(-1, self.n_inputs, self.omega.size)
 
     def responses(self, pole: complex) -> Pair:
-        s = 1j * self.omega
-        above, below = (self._of_each_reference(1.0 / (s - p)[None]) for p in (pole, pole.conjugate()))
-        return rows_of_pair(above, below)
+        poles = pole, pole.conjugate()
+        return rows_of_pair(*(self._of_each_reference(1.0 / (1j * self.omega - p)[None]) for p in poles))
 
     def slopes(self, pole: complex, participation: np.ndarray) -> Pair:
         return self.power_of_pole(pole, participation, 2)
@@ -205,11 +194,8 @@ class Lines:
 
 
 def rows_of_pair(above: np.ndarray, below: np.ndarray) -> Pair:
-    """Rows of the fit (n_rows, n) of the real and of the imaginary part of the factor of pairs of poles.
-
-    Args:
-        above, below: (n, n_references, n_lines) terms of each pole and of its conjugate.
-    """
+    """Rows of the fit (n_rows, n) of the real and of the imaginary part of the factor of pairs of poles, from the terms
+    (n, n_references, n_lines) of each pole and of its conjugate."""
     return _rows_of(0.5 * (above + below)), _rows_of(-0.5j * (above - below))
 
 
@@ -227,14 +213,11 @@ def _mean_of_decay(total: float) -> float:
 def window_rate(residual: np.ndarray, omega: np.ndarray) -> float:
     """1/τ of the exponential window exp(-t/τ) that correlates the noise of neighbouring lines, rad/s; 0 if none.
 
+    From the residual (..., n_lines), complex, in units of its noise.
     Second differences of the lines remove the smooth response. Over the time t of the impulse response, their noise has
     the power exp(-2t/τ) (2 - 2 cos(2πt/T))², whose transform is its correlation. Only phases are used, so that a few
     loud lines count little: for normal z and w of correlation r, the mean of the product of their phasors is π/4 r
     F(1/2, 1/2; 2; |r|²) (Middleton, Introduction to Statistical Communication Theory, ch. 9).
-
-    Args:
-        residual: (..., n_lines) in units of its noise, complex.
-        omega: (n_lines,).
     """
     step = np.diff(omega)
     if np.ptp(step) > 1e-6 * step.max():
@@ -248,10 +231,9 @@ def window_rate(residual: np.ndarray, omega: np.ndarray) -> float:
     model = power @ np.exp(-2j * np.pi * np.outer(instants, lags)) / power.sum(axis=1, keepdims=True)
     misfit = np.linalg.norm(correlation - np.pi / 4.0 * model * hyp2f1(0.5, 0.5, 2.0, np.abs(model) ** 2), axis=1)
     best = int(np.argmin(misfit))
-    sure = (
-        misfit[0] - misfit[best] > LINES.windowed / np.sqrt(omega.size) and misfit[best] < LINES.explained * misfit[0]
-    )
-    return float(WINDOWS[best] * step.mean() / (2.0 * np.pi)) if sure else 0.0
+    significant = misfit[0] - misfit[best] > LINES.windowed / np.sqrt(omega.size)
+    is_found = significant and misfit[best] < LINES.explained * misfit[0]
+    return float(WINDOWS[best] * step.mean() / (2.0 * np.pi)) if is_found else 0.0
 
 
 def relative_noise(lines: Lines, fit: Fit) -> np.ndarray | None:

@@ -36,10 +36,7 @@ SUBSPACE = SubspaceSettings()
 def subspace_poles(records: Sequence[Record], delays: np.ndarray, order: int) -> np.ndarray:
     """Poles λ of positive frequency of a subspace model, (n_poles,) rad/s; none where inputs act too briefly.
 
-    Args:
-        records: of the same inputs and outputs at one rate.
-        delays: (n_inputs,) of each input, whole samples.
-        order: number of states.
+    From the delay of each input in whole samples, (n_inputs,), and the number of states.
     """
     m, q = records[0].n_outputs, records[0].n_inputs
     rows_per_lag = 2 * (m + q)

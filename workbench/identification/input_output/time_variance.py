@@ -23,7 +23,7 @@ from scipy.signal import lfilter
 
 from workbench.arrays import Floats, scaled_inverse
 from workbench.identification.input_output.changing_response import CHANGE_CHECK, in_place_of
-from workbench.identification.input_output.competing_models import in_place_of_clusters, orthonormal_basis
+from workbench.identification.input_output.competing_models import COMPETING, in_place_of_clusters, orthonormal_basis
 from workbench.identification.input_output.fit_errors import statistic_of, statistic_of_each
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import (
@@ -48,10 +48,9 @@ class ChangingSettings:
 
     sure: float = 5.0  # standard errors that a change must exceed
     near: float = 3.0  # half-power bandwidths: two modes closer than this may be one changing mode
-    alike: float = 0.9  # MAC of such modes
     instead: float = 0.5  # share of the χ² of the second mode that a change of the first must explain to replace it
     matters: float = 0.1  # of the half-power bandwidth: a smaller change is negligible
-    reach: float = 0.15  # of the frequency of a mode, within which weaker modes may model its change
+    reach: float = 0.15  # of the frequency of a mode, within which weaker modes may model its change or distortion
     faint: float = 0.2  # of its statistic, below which a mode is such a weaker one
     collinear: float = 1e-4  # singular value of columns of unit length, above which they count
     faded: float = 4.0  # time constants of a mode in the record, above which the first-order formula holds
@@ -62,12 +61,8 @@ IS_MEAN = "its parameters are means over the record: identify shorter parts, or 
 
 
 class Change(NamedTuple):
-    """Change of each frequency from the beginning of a record to its end, relative, and its standard error.
-
-    Attributes:
-        frequency, deviation: (n_modes,).
-        sure: (n_modes,) whether it is significant and not negligible.
-    """
+    """Change of each frequency from the beginning of a record to its end, relative, its standard error, and whether it
+    is significant and not negligible, (n_modes,) each."""
 
     frequency: Floats
     deviation: Floats
@@ -100,11 +95,7 @@ def changes_in_time(data: KnownInputs, fit: Fit) -> Change:
 
 
 def slopes_in_time(data: KnownInputs, fit: Fit, x: Floats) -> tuple[Floats, Floats]:
-    """Real and imaginary part of (t - T/2) / T ∂z/∂λ of each mode, (n_rows, n_modes) each.
-
-    Args:
-        x: `regressors` of the fit, which hold ∂z/∂λ.
-    """
+    """Real and imaginary part of (t - T/2) / T ∂z/∂λ of each mode, (n_rows, n_modes) each, from the `regressors` x."""
     n, q = fit.poles.size, 1 + fit.participation.shape[1]
     real, imaginary = (data.times_time(x[:, part * n * q : (part + 1) * n * q : q]) for part in (0, 1))
     return real, imaginary
@@ -135,19 +126,15 @@ def beside_changing(
     """The records with the columns of changing modes, and the fit without the modes that modelled their change.
 
     A large change is fitted by several linear modes. Where the Volterra terms of one mode explain what the weaker modes
-    about it explain, these are removed and the terms become fixed columns. None where no mode is so.
-
-    Args:
-        linear: see `in_place_of`.
+    about it explain, these are removed and the terms become fixed columns. None where no mode is so. For `linear` see
+    `in_place_of`.
     """
     if fit.noise.size * data.n_inputs == 1:
         return _with_competing_models(data, fit, limit, time_limit, linear)
     strength = statistic_of_each(fit)
     participation = fit.participation[:, : data.n_inputs].T
-    alike = mac(fit.amplitudes, fit.amplitudes) * mac(participation, participation) > CHANGING.alike
-    columns_of_changing: list[Floats] = []
-    changing: list[complex] = []
-    removed = np.zeros(fit.poles.size, bool)
+    alike = mac(fit.amplitudes, fit.amplitudes) * mac(participation, participation) > COMPETING.alike
+    motions, changing, removed = list[Floats](), list[complex](), np.zeros(fit.poles.size, bool)
     for r in np.argsort(-strength):
         weak = strength < CHANGING.faint * strength[r]
         close = np.abs(fit.poles.imag - fit.poles.imag[r]) < CHANGING.reach * np.abs(fit.poles.imag[r])
@@ -161,12 +148,12 @@ def beside_changing(
         decrease = added_misfit(one, fit, fit.noise)
         phi = columns(data, one.poles, one.participation)[0]
         if _explained(data, one, phi, motion, fit.noise) > CHANGING.instead * decrease:
-            columns_of_changing.append(motion)
+            motions.append(motion)
             changing.append(complex(one.poles[at]))
             removed[others] = True
-    if not columns_of_changing:
+    if not motions:
         return None
-    data = data.with_columns(orthonormal_basis(np.hstack(columns_of_changing), CHANGING.collinear), tuple(changing))
+    data = data.with_columns(orthonormal_basis(np.hstack(motions), CHANGING.collinear), tuple(changing))
     return data, only(data, fit, ~removed)
 
 
@@ -177,13 +164,11 @@ def _with_competing_models(
     omega = fit.poles.imag
     close = np.abs(np.subtract.outer(omega, omega)) < CHANGING.reach * omega[:, None]
     rows_of = cache(lambda data: regressors(data, fit.poles, fit.participation))
-    return in_place_of_clusters(
-        data,
-        fit,
-        close,
-        lambda data, cluster: in_place_of(data, fit, cluster, rows_of(data), limit, time_limit, linear),
-        time_limit,
-    )
+
+    def alternative_of(data: KnownInputs, cluster: np.ndarray) -> tuple[KnownInputs, complex] | None:
+        return in_place_of(data, fit, cluster, rows_of(data), limit, time_limit, linear)
+
+    return in_place_of_clusters(data, fit, close, alternative_of, time_limit)
 
 
 def _motion(data: KnownInputs, pole: complex, participation: np.ndarray) -> Floats:
@@ -195,11 +180,8 @@ def _motion(data: KnownInputs, pole: complex, participation: np.ndarray) -> Floa
 
 
 def _series(z: np.ndarray, pole: complex, dt: float) -> Floats:
-    """Volterra terms of a mode up to the third order, real and imaginary parts, (n_samples, n_columns).
-
-    Args:
-        z: (n_samples,) of the constant mode.
-    """
+    """Volterra terms of a mode up to the third order, real and imaginary parts, (n_samples, n_columns), from z
+    (n_samples,) of the constant mode."""
     mu, time = np.exp(pole * dt), np.linspace(-0.5, 0.5, z.size)
     z = z / max(float(np.abs(z).max()), 1e-300)
     power = np.abs(z) ** 2
@@ -236,7 +218,7 @@ def _explained(data: KnownInputs, fit: Fit, phi: Floats, further: Floats, noise:
 
 def _pairs_alike(fit: Fit) -> list[tuple[int, int]]:
     """Pairs of close modes with similar shapes, the closest first."""
-    poles, alike = fit.poles, mac(fit.amplitudes, fit.amplitudes) > CHANGING.alike
+    poles, alike = fit.poles, mac(fit.amplitudes, fit.amplitudes) > COMPETING.alike
     distance = np.abs(np.subtract.outer(poles.imag, poles.imag))
     close = distance < CHANGING.near * np.add.outer(np.abs(poles.real), np.abs(poles.real))
     pairs = zip(*np.nonzero(np.triu(alike & close, 1)), strict=True)
@@ -252,15 +234,8 @@ def named_near(fit: Fit, poles: Iterable[complex]) -> dict[int, str]:
 def change_remarks(
     data: KnownInputs, fit: Fit, changing: tuple[complex, ...] = (), named: tuple[complex, ...] = ()
 ) -> tuple[tuple[str, ...], tuple[complex, ...]]:
-    """Remarks on the modes that change within a record: linearly with time, or otherwise at the poles given.
-
-    Args:
-        changing: poles of modes detected as changing.
-        named: poles of the fit that a remark names already.
-
-    Returns:
-        The remarks, and the poles of all modes that a remark names.
-    """
+    """Remarks on the modes that change within a record, linearly with time, or otherwise at poles `changing`, and the
+    poles of all modes that a remark names, those `named` already among them."""
     if not fit.poles.size:
         return (), ()
     change = changes_in_time(data, fit)
@@ -268,13 +243,9 @@ def change_remarks(
     sure = change.sure & (np.abs(change.frequency) < CHANGING.reach) & ~np.isin(fit.poles, named)
     linear = [f"{names[r]} by about {100 * change.frequency[r]:+.1g} %" for r in np.flatnonzero(sure).tolist()]
     others = [r for r in named_near(fit, changing) if not sure[r] and fit.poles[r] not in named]
-    remarks = []
-    if linear:
-        linearly = (
-            f"frequencies change within the record, from its beginning to its end: {'; '.join(linear)}; {IS_MEAN}"
-        )
-        remarks.append(linearly)
-    if others:
-        names_of_others = ", ".join(names[r] for r in others)
-        remarks.append(f"modes change within the record, perhaps with amplitude: {names_of_others}; {IS_MEAN}")
-    return tuple(remarks), (*named, *fit.poles[[*np.flatnonzero(sure), *others]].tolist())
+    each = (
+        ("frequencies change within the record, from its beginning to its end", "; ".join(linear)),
+        ("modes change within the record, perhaps with amplitude", ", ".join(names[r] for r in others)),
+    )
+    remarks = tuple(f"{what}: {which}; {IS_MEAN}" for what, which in each if which)
+    return remarks, (*named, *fit.poles[[*np.flatnonzero(sure), *others]].tolist())

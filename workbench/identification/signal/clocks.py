@@ -46,22 +46,14 @@ def shape_errors(estimates: ShapeEstimates) -> np.ndarray:
 
 
 def are_far(far: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Indices of modes that are complex beyond their errors.
-
-    Args:
-        far: (n_modes,) relative distance from the nearest real mode.
-        error: (n_modes,) relative standard error.
-    """
+    """Indices of modes whose relative distance from the nearest real one, (n_modes,), exceeds its error."""
     return np.flatnonzero(far > np.maximum(CLOCKS.far, SURE * error))
 
 
 def shape_remarks(estimates: ShapeEstimates, names: Sequence[str], only: Sequence[int]) -> tuple[str, ...]:
     """A remark where shapes are complex beyond their errors; it names a delayed sensor where that is the cause.
 
-    Args:
-        estimates: modes with the covariance of their shapes.
-        names: (n_outputs,) of the sensors.
-        only: the modes to examine, from 0.
+    `only` are the modes to examine, from 0.
     """
     far = far_from_real(estimates.modes)
     which = np.intersect1d(only, are_far(far, shape_errors(estimates))).tolist()
@@ -107,16 +99,12 @@ def _delayed_sensor(modes: SampledModes) -> tuple[int, float] | None:
 
 
 def clock_remarks(estimates: ModalEstimates, only: Sequence[int]) -> tuple[str, ...]:
-    """A remark where all modes form pairs of equal damping and one ratio of frequencies: the sample rates differ.
-
-    Args:
-        estimates: modes of several outputs or records, sorted by frequency.
-        only: the modes to examine, from 0.
-    """
+    """A remark where all modes, sorted by frequency, form pairs of equal damping and one ratio of frequencies: the
+    sample rates differ. `only` are the modes to examine, from 0."""
     if len(only) < 4 or len(only) % 2:
         return ()
-    omega, zeta = (values[list(only)].reshape(-1, 2).T for values in (estimates.modes.omega, estimates.modes.zeta))
-    omega_std, zeta_std = (values[list(only)].reshape(-1, 2).T for values in (estimates.omega_std, estimates.zeta_std))
+    both = estimates.modes.omega, estimates.modes.zeta, estimates.omega_std, estimates.zeta_std
+    omega, zeta, omega_std, zeta_std = (values[list(only)].reshape(-1, 2).T for values in both)
     ratio, error = omega[1] / omega[0] - 1.0, np.hypot(*(omega_std / omega))
     mean = np.average(ratio, weights=error**-2)
     separate = (SURE * error < ratio) & (ratio < CLOCKS.ratio)
@@ -164,11 +152,9 @@ def late_outputs(residues: np.ndarray, poles: np.ndarray, least: float = CLOCKS.
 
     each = np.arange(squares.shape[1])
     together = delay_of(each, np.ones(omega.size, bool))
-    return (
-        np.full(each.size, together)
-        if together
-        else np.array([delay_of(each[j : j + 1], share[:, j] > CLOCKS.least) for j in each])
-    )
+    if together:
+        return np.full(each.size, together)
+    return np.array([delay_of(each[j : j + 1], share[:, j] > CLOCKS.least) for j in each])
 
 
 def _delay_of_phases(phases: np.ndarray, omega: np.ndarray, fastest: float) -> tuple[float, float]:

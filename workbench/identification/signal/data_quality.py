@@ -1,10 +1,11 @@
-"""Data quality: lost samples; faulty channels, dead, copied, clipped, upsampled or of no stated quantity."""
+"""Data quality: lost or wrong samples; channels that are dead, copied, clipped, upsampled or of no stated quantity."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from workbench.arrays import Floats
 from workbench.records.record import Record, as_records
 from workbench.records.units import LIKELY, unknown_unit
 from workbench.rig.sensors import MEASURED
@@ -37,6 +38,11 @@ class DataSettings:
     straight: float = 1e-9  # rounding deviation of samples from a straight line, relative to the output's range
     moves: float = 100.0  # least motion from sample to sample there, in resolutions of the output
     block: int = 256  # outputs compared with all others at once: all pairs of 10,000 would take 800 MB
+    parts: int = 50  # into which a record is divided, in the search for a burst of the residual
+    samples: int = 10  # of each part at least
+    together: int = 3  # consecutive parts that hold the burst
+    share: float = 0.3  # of the residual energy in these at least, where noise has 0.06
+    times: float = 2.5  # the share expected from the motion in these, at least
 
 
 DATA = DataSettings()
@@ -73,14 +79,8 @@ def data_faults(record: Record) -> tuple[DataFault, ...]:
     dead = list(_dead(record))
     names = {fault.outputs[0] for fault in dead}
     alive = [j for j, name in enumerate(record.output_names) if name not in names]
-    return (
-        *dead,
-        *_copied(record, alive),
-        *_clipped(record, alive),
-        *_upsampled(record, alive),
-        *_unstated(record, alive),
-        *input_faults(record),
-    )
+    of_outputs = (fault for test in (_copied, _clipped, _upsampled, _unstated) for fault in test(record, alive))
+    return (*dead, *of_outputs, *input_faults(record))
 
 
 def input_faults(record: Record) -> tuple[DataFault, ...]:
@@ -91,25 +91,15 @@ def input_faults(record: Record) -> tuple[DataFault, ...]:
     """
     faults = []
     for channel, row in zip(record.input_channels, record.inputs, strict=True):
-        stops = [
-            at
-            for at in _piled(row).values()
-            if at.size
-            and row[at[0]]
-            and _piles_up(row, at, DATA.least_piled_input, DATA.piled_input)
-            and not _has_levels(row, at)
-        ]
+        piled = [a for a in _piled(row).values() if _piles_up(row, a, DATA.least_piled_input, DATA.piled_input)]
+        stops = [at for at in piled if row[at[0]] and not _has_levels(row, at)]
         if stops:
             ends, count = " and ".join(f"{row[at[0]]:g}" for at in stops), sum(at.size for at in stops)
-            faults.append(
-                DataFault(
-                    "clipped",
-                    (),
-                    f"input {channel.name!r} is clipped at {ends}, {count} samples: unless it was sent like that, the"
-                    " input beyond is lost, and modes, their masses above all, are wrong; measure with a larger range",
-                    inputs=(channel.name,),
-                )
+            message = (
+                f"input {channel.name!r} is clipped at {ends}, {count} samples: unless it was sent like that, the input"
+                " beyond is lost, and modes, their masses above all, are wrong; measure with a larger range"
             )
+            faults.append(DataFault("clipped", (), message, inputs=(channel.name,)))
     return tuple(faults)
 
 
@@ -120,17 +110,12 @@ def check_data_quality(record: Record) -> None:
         ValueError: the first of `data_faults` that is one of outputs.
     """
     for fault in data_faults(record):
-        if fault.inputs:
-            continue
-        raise ValueError(f"record {record.name!r}: {fault.message}")
+        if not fault.inputs:
+            raise ValueError(f"record {record.name!r}: {fault.message}")
 
 
 def check_outputs_move(records: Sequence[Record]) -> None:
-    """Refuse an output that is constant in every record, of the same outputs.
-
-    Raises:
-        ValueError: naming the output.
-    """
+    """Refuse an output that is constant in every record, of the same outputs, by a ValueError that names it."""
     for name, *rows in zip(records[0].output_names, *(record.outputs for record in records), strict=True):
         if not any(np.ptp(row) for row in rows):
             raise ValueError(f"output {name!r} stays at {rows[0][0]:g}: the sensor is dead; leave it out")
@@ -212,12 +197,9 @@ def dropouts(record: Record) -> tuple[tuple[str, float, int, str], ...]:
 
 
 def dropout_remark(record: Record, after: str, *, before: float = np.inf) -> tuple[str, ...]:
-    """A remark on the dropouts of a record; empty where there are none.
+    """A remark on the dropouts of a record that begin before a time, s; empty where there are none.
 
-    Args:
-        record: the record.
-        after: second sentence of the remark: the consequence, and the way out.
-        before: s, dropouts that begin later are ignored.
+    Its second sentence, `after`, is the consequence, and the way out.
     """
     early = [dropout for dropout in dropouts(record) if dropout[1] < before]
     if not early:
@@ -227,6 +209,45 @@ def dropout_remark(record: Record, after: str, *, before: float = np.inf) -> tup
     return (
         f"in record {record.name!r} output {name!r} {how} for {count} samples from {at:.6g} s on{more}: lost data?"
         f" {after}",
+    )
+
+
+def burst_remarks(records: Sequence[Record], residuals: Sequence[Floats], noise: Floats) -> tuple[str, ...]:
+    """A remark on each record whose outputs lost samples, or most of whose residual lies within a short part.
+
+    Where samples are lost, the state of the structure jumps, and the residual decays as its modes do. The residual of a
+    nonlinear structure grows with its motion, up to the cube; that is no burst. Residuals (n_samples, n_outputs) are
+    aligned with the last samples of each record, and have standard deviations `noise` (n_outputs,).
+    """
+    remarks: list[str] = []
+    for record, residual in zip(records, residuals, strict=True):
+        lost = dropout_remark(record, "Modes and changes are wrong by it; leave it out, or cut the record")
+        remarks += lost or _burst(record, residual, noise)
+    return tuple(remarks)
+
+
+def _burst(record: Record, residual: Floats, noise: Floats) -> tuple[str, ...]:
+    motion = record.outputs[:, -len(residual) :].T
+    noise_free = noise < DATA.noise_free * motion.std(axis=0)
+    if len(residual) < DATA.parts * DATA.samples or noise_free.all():
+        return ()
+    residual = residual / noise
+    motion = (motion - motion.mean(axis=0)) / np.maximum(motion.std(axis=0), 1e-300)
+    shares, moving = (np.array([np.vdot(p, p) for p in np.array_split(x, DATA.parts)]) for x in (residual, motion))
+    together = np.ones(DATA.together)
+    # noise in proportion to the motion, and cubic distortion
+    expected = [np.convolve(moving**k / max((moving**k).sum(), 1e-300), together, "valid") for k in (1, 3)]
+    shares = np.convolve(shares / max(shares.sum(), 1e-300), together, "valid")
+    first = int(np.argmax(shares))
+    least = max(DATA.share, DATA.times * max(each[first] for each in expected))
+    if shares[first] < least or expected[0].max() > DATA.share:  # after an impact the motion itself is a burst
+        return ()
+    edges = np.array_split(record.time[-len(residual) :], DATA.parts)
+    begins, ends = edges[first][0], edges[first + DATA.together - 1][-1]
+    return (
+        f"in record {record.name!r} {100 * shares[first]:.0f} % of the residual energy lies from {begins:.4g} to"
+        f" {ends:.4g} s: lost or wrong samples, or an unmeasured impact? It may look like noise of the inputs, or like"
+        " modes that change; leave that part out",
     )
 
 
@@ -283,12 +304,11 @@ def _copied(record: Record, alive: list[int]) -> Iterator[DataFault]:
             difference = scaled[i] - np.sign(alike[row, others])[:, None] * scaled[first + others]
             for j in (first + others[np.sqrt((difference**2).mean(axis=1)) < DATA.copied * noise]).tolist():
                 copies.add(j)
-                yield DataFault(
-                    "copied",
-                    (names[i], names[j]),
+                message = (
                     f"outputs {names[i]!r} and {names[j]!r} are the same signal, its noise included, which would count"
-                    " twice; leave one out",
+                    " twice; leave one out"
                 )
+                yield DataFault("copied", (names[i], names[j]), message)
 
 
 def _innovation_std(row: np.ndarray) -> float:
@@ -308,13 +328,11 @@ def _clipped(record: Record, alive: list[int]) -> Iterator[DataFault]:
         if clear:
             # Where one end of the range is too small, so may be the other: two equal samples are enough there.
             at, last = piled[clear[0]], float(record.time[max(a[-1] for a in piled.values() if a.size > 1)])
-            yield DataFault(
-                "clipped",
-                (name,),
+            message = (
                 f"output {name!r} is clipped {clear[0]} at {row[at[0]]:g}, {at.size} samples; up to {last:g} s motion"
-                " beyond the range is lost and would be read as modes; begin later, or measure with a larger range",
-                until=last,
+                " beyond the range is lost and would be read as modes; begin later, or measure with a larger range"
             )
+            yield DataFault("clipped", (name,), message, until=last)
 
 
 def _piled(row: np.ndarray) -> dict[str, np.ndarray]:
@@ -350,13 +368,12 @@ def _upsampled(record: Record, alive: list[int]) -> Iterator[DataFault]:
             every = int(np.gcd.reduce(np.diff(changes))) if changes.size >= DATA.fewest_changes else 1
             # An output that rests for long has changes that are far apart too, but few.
             if 1 < every <= DATA.slowest and changes.size > 0.5 * (np.ptp(changes) // every):
-                yield DataFault(
-                    "upsampled",
-                    (name,),
+                message = (
                     f"output {name!r} changes once in {every} samples only: it was sampled at"
                     f" {record.sample_rate_hz / every:g} Hz and {how}, not at {record.sample_rate_hz:g} Hz; leave it"
-                    " out, or bring all outputs to that rate",
+                    " out, or bring all outputs to that rate"
                 )
+                yield DataFault("upsampled", (name,), message)
                 break
 
 
@@ -365,16 +382,12 @@ def _unstated(record: Record, alive: list[int]) -> Iterator[DataFault]:
     moving = [channel for channel in channels if channel.quantity in MEASURED]
     for channel in channels:
         if moving and not channel.quantity:
-            unit = unknown_unit(channel.name)
-            stated = f"states the unit {unit}, which is not known" if unit else "states no quantity"
-            remedy = (
-                f"write its numbers in a known unit, one of {LIKELY}"
-                if unit
-                else f"state its unit in the file, as in '{channel.name} [m/s^2]'"
-            )
-            yield DataFault(
-                "unstated",
-                (channel.name,),
+            stated, remedy = "states no quantity", f"state its unit in the file, as in '{channel.name} [m/s^2]'"
+            if unit := unknown_unit(channel.name):
+                stated = f"states the unit {unit}, which is not known"
+                remedy = f"write its numbers in a known unit, one of {LIKELY}"
+            message = (
                 f"output {channel.name!r} {stated}, and {moving[0].name!r} measures {moving[0].quantity}: it would be"
-                f" taken for a displacement; {remedy}, or leave it out",
+                f" taken for a displacement; {remedy}, or leave it out"
             )
+            yield DataFault("unstated", (channel.name,), message)

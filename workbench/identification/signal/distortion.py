@@ -31,29 +31,17 @@ PERIODIC = PeriodicSettings()
 
 @dataclass(frozen=True, eq=False)
 class Distortion:
-    """Fourier lines of the mean period of a record, and their noise.
+    """Fourier lines of the mean period of a record, and their noise."""
 
-    Attributes:
-        name: of the record.
-        frequencies_hz: (n_lines,) multiples k / T of the period's frequency, k = 1, 2, ...
-        excited: (n_lines,) whether the inputs have that line.
-        amplitudes: (n_outputs, n_lines) rms of each line, in the unit of the output.
-        noise: (n_outputs, n_lines) standard error of each, from the scatter between periods.
-        channels: of the outputs.
-        n_periods: number of periods averaged.
-        input_rms: of all inputs together.
-        input_amplitudes: (n_lines,) rms of each line of all inputs together.
-    """
-
-    name: str
-    frequencies_hz: np.ndarray
-    excited: np.ndarray
-    amplitudes: np.ndarray
-    noise: np.ndarray
-    channels: tuple[Channel, ...]
-    n_periods: int
-    input_rms: float
-    input_amplitudes: np.ndarray
+    name: str  # of the record
+    frequencies_hz: np.ndarray  # (n_lines,) multiples k / T of the frequency of the period
+    excited: np.ndarray  # (n_lines,) whether the inputs have that line
+    amplitudes: np.ndarray  # (n_outputs, n_lines) rms of each line, in the unit of the output
+    noise: np.ndarray  # (n_outputs, n_lines) standard error of each, from the scatter between periods
+    channels: tuple[Channel, ...]  # of the outputs
+    n_periods: int  # number of periods averaged
+    input_rms: float  # of all inputs together
+    input_amplitudes: np.ndarray  # (n_lines,) rms of each line of all inputs together
 
     @property
     def even(self) -> np.ndarray:

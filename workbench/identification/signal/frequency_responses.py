@@ -32,22 +32,13 @@ SPECTRA = SpectraSettings()
 
 @dataclass(frozen=True, eq=False)
 class FrfEstimate:
-    """H1 of several inputs with its coherence.
+    """H1 of several inputs with its coherence."""
 
-    Attributes:
-        frf: NaN where an input is silent, or not to be told from the others, and where the inputs are weak and no
-            output is coherent with them.
-        coherence: (n_outputs, n_lines) multiple coherence of each output with all inputs, in [0, 1], NaN as above.
-        averages: number of segments, which overlap by half.
-        units: one per input.
-        silent: names of inputs that are constant throughout, and left out.
-    """
-
-    frf: FrequencyResponses
-    coherence: Floats
-    averages: int
-    units: tuple[str, ...]
-    silent: tuple[str, ...]
+    frf: FrequencyResponses  # NaN where an input is silent, or like the others, or weak and no output is coherent
+    coherence: Floats  # (n_outputs, n_lines) multiple coherence of each output with all inputs, in [0, 1], NaN as above
+    averages: int  # number of segments, which overlap by half
+    units: tuple[str, ...]  # one per input
+    silent: tuple[str, ...]  # names of inputs that are constant throughout, and left out
 
 
 def frequency_responses(records: Sequence[Record]) -> FrfEstimate:
@@ -59,7 +50,7 @@ def frequency_responses(records: Sequence[Record]) -> FrfEstimate:
         records: of the same inputs and outputs at one sample rate; averages are over all.
 
     Raises:
-        ValueError: no input that varies, records too short, or inputs that are not to be told apart: the two that are
+        ValueError: no input that varies, records too short, or inputs that cannot be distinguished: the two that are
             most alike are named, with their coherence.
 
     Source: Bendat and Piersol, Random Data, 4th ed., sections 7.3 and 7.4.
@@ -78,22 +69,22 @@ def frequency_responses(records: Sequence[Record]) -> FrfEstimate:
     lines = np.fft.rfftfreq(segment, first.sample_time)[1:]
     of_inputs, across = spectra[:n, :n].transpose(2, 0, 1), spectra[n:, :n].transpose(2, 0, 1)
     powers = of_inputs.diagonal(axis1=1, axis2=2).real  # (n_lines, n_inputs)
-    heard = (powers > SPECTRA.silent * powers.max(axis=0)).all(axis=1)
+    nonzero = (powers > SPECTRA.silent * powers.max(axis=0)).all(axis=1)
     scales = np.sqrt(np.where(powers > 0.0, powers, 1.0))
     alike = of_inputs / (scales[:, :, None] * scales[:, None])
-    inverse = np.linalg.inv(np.where(heard[:, None, None], alike, 0.0) + 1e-12 * np.eye(n))
+    inverse = np.linalg.inv(np.where(nonzero[:, None, None], alike, 0.0) + 1e-12 * np.eye(n))
     with_others: Floats = np.asarray(1.0 - 1.0 / inverse.diagonal(axis1=1, axis2=2).real, np.float64)
-    apart = heard & (with_others < SPECTRA.alike).all(axis=1)
-    excited = heard & (powers > SPECTRA.excited * powers.max(axis=0)).all(axis=1)
+    distinct = nonzero & (with_others < SPECTRA.alike).all(axis=1)
+    excited = nonzero & (powers > SPECTRA.excited * powers.max(axis=0)).all(axis=1)
     _check_apart(names, alike, with_others, excited)
     scaled = (across / scales[:, None]) @ inverse
     outputs = spectra[n:, n:].diagonal().real  # (n_lines, n_outputs)
     explained = np.einsum("fji,fji->fj", scaled, (across / scales[:, None]).conj()).real
     coherence = np.divide(explained, outputs, out=np.full_like(explained, np.nan), where=outputs > 0.0)
-    apart &= excited | (coherence > SPECTRA.coherent).any(axis=1)
-    values = np.where(apart[:, None, None], scaled / scales[:, None], np.nan)
+    distinct &= excited | (coherence > SPECTRA.coherent).any(axis=1)
+    values = np.where(distinct[:, None, None], scaled / scales[:, None], np.nan)
     found = FrequencyResponses(values.transpose(1, 2, 0), lines, first.output_channels, names, name=first.name)
-    coherence = np.where(apart[:, None], np.clip(coherence, 0.0, 1.0), np.nan).T
+    coherence = np.where(distinct[:, None], np.clip(coherence, 0.0, 1.0), np.nan).T
     silent = tuple(name for i, name in enumerate(first.input_names) if i not in active)
     units = tuple(first.input_channels[i].unit for i in active)
     return FrfEstimate(found, coherence, averages, units, silent)
@@ -126,13 +117,13 @@ def _check_apart(names: Sequence[str], alike: np.ndarray, with_others: Floats, e
     if pairs[i, j] >= SPECTRA.alike:
         raise ValueError(
             f"the inputs {names[i]} and {names[j]} are correlated, with a coherence of {pairs[i, j]:.3f} between them;"
-            " independent inputs are needed to tell the responses apart"
+            " independent inputs are needed to distinguish the responses"
         )
     worst = int(np.argmax(np.median(with_others[excited], axis=0)))
     raise ValueError(
         f"the input {names[worst]} follows from the others, with a multiple coherence of"
         f" {np.median(with_others[excited, worst]):.3f}; most alike are {names[i]} and {names[j]}, with a coherence of"
-        f" {pairs[i, j]:.3f}; independent inputs are needed to tell the responses apart"
+        f" {pairs[i, j]:.3f}; independent inputs are needed to distinguish the responses"
     )
 
 

@@ -14,13 +14,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from workbench.arrays import Complexes, Floats
+from workbench.identification.signal.modal_estimates import SURE
 from workbench.records.record import Record
 from workbench.structure.printed import mode_text
 
 
 @dataclass(frozen=True)
 class HarmonicSettings:
-    """Constants of the test for harmonic excitation."""
+    """Constants of the tests for harmonic excitation and for overtones."""
 
     # Largest ratio of the mean of |z|⁴ to the square of the mean of |z|² for a sine. In random motion over six decay
     # times of a mode one in a thousand is below 1.42; a sine with a tenth of its power in random motion has 1.17.
@@ -28,24 +29,14 @@ class HarmonicSettings:
     lines: int = 8  # least number of lines on either side that form the envelope
     false_alarm: float = 1e-4  # probability that a line of random motion is taken for a sine
     peaked: float = 5.0  # power at the peak of a mode over its median within two bandwidths: 1 + 2²
-
-
-HARMONICS = HarmonicSettings()
-
-
-@dataclass(frozen=True)
-class OvertoneSettings:
-    """Constants of the search for overtones."""
-
     highest: int = 9  # order of an overtone
     at_most: float = 0.03  # largest amplitude of an overtone, relative to its base
     within: float = 2e-3  # relative tolerance of its frequency
     scatters: float = 2.0  # further tolerance of its frequency, in rms scatters of the base's frequency times the order
-    sure: float = 3.0  # further tolerance of frequency and decay rate, in standard errors
     damping: float = 0.2  # relative tolerance of its decay rate
 
 
-OVERTONES = OvertoneSettings()
+HARMONICS = HarmonicSettings()
 MAINS_HZ = (50.0, 60.0)
 
 
@@ -76,7 +67,7 @@ def harmonic_remarks(
 
 
 def _is_steady(lines: Complexes, power: Floats, pole: complex) -> bool:
-    """Whether the motion about a pole is harmonic.
+    """Whether the motion about a pole, in units of the line spacing, is harmonic.
 
     Either the envelope is constant in the output of the largest share of power there, or one line of any output stands
     out of a broad peak: the power of random motion has an exponential distribution, whose median is ln 2 of its mean.
@@ -84,7 +75,6 @@ def _is_steady(lines: Complexes, power: Floats, pole: complex) -> bool:
     Args:
         lines: (n_outputs, n_lines) Fourier transform of the outputs.
         power: (n_outputs,) sum of squares of the outputs.
-        pole: in units of the line spacing.
     """
     half = max(2.0 * abs(pole.real), HARMONICS.lines)
     first, last = (round(pole.imag + side * half) for side in (-1.0, 1.0))
@@ -109,15 +99,12 @@ def near_mains(frequency_hz: float) -> bool:
 def multiple_of(frequencies: Floats, size: Floats, r: int) -> tuple[int | None, int]:
     """The far stronger base mode of which mode r may be an overtone, and the order of the overtone; None and 0 if none.
 
-    Args:
-        frequencies: (n_modes,) in any unit.
-        size: (n_modes,) amplitudes.
-        r: index of the mode.
+    From frequencies (n_modes,) in any unit and amplitudes (n_modes,).
     """
     for base in np.argsort(-size):
         times = round(frequencies[r] / frequencies[base])
-        near = abs(frequencies[r] / frequencies[base] - times) < OVERTONES.within * times
-        if 2 <= times <= OVERTONES.highest and near and size[r] < OVERTONES.at_most * size[base]:
+        near = abs(frequencies[r] / frequencies[base] - times) < HARMONICS.within * times
+        if 2 <= times <= HARMONICS.highest and near and size[r] < HARMONICS.at_most * size[base]:
             return int(base), times
     return None, 0
 
@@ -136,13 +123,13 @@ def overtone_remarks(poles: np.ndarray, size: Floats, scatter: Floats, deviation
     """
     overtones, base_modes = [], set()
     for r in range(poles.size):
-        bases = [base for base in np.flatnonzero(scatter) if size[r] < OVERTONES.at_most * size[base]]
+        bases = [base for base in np.flatnonzero(scatter).tolist() if size[r] < HARMONICS.at_most * size[base]]
         for base in sorted(bases, key=lambda k: -size[k]):
-            sums = _sums(poles, size, int(base), r)
+            sums = _sums(poles, size, base, r)
             words = next((w for w, pole, n in sums if _agrees(poles[r], pole, n * scatter[base], deviation[r])), None)
             if words is not None:
                 overtones.append(f"{mode_text(r, poles[r].imag / (2.0 * np.pi))} lies at {words}")
-                base_modes.add(int(base) + 1)
+                base_modes.add(base + 1)
                 break
     if not overtones:
         return ()
@@ -162,17 +149,16 @@ def _sums(poles: np.ndarray, size: Floats, base: int, r: int) -> Iterator[tuple[
     own = complex(poles[base])
     for times in (2, 3):
         yield f"{times} × mode {base + 1}", times * own, times
-    for other in np.flatnonzero(OVERTONES.at_most * size > size[r]):
-        for times in (1, 2) if other != base else ():
-            for sign in (1.0, -1.0):
+    for other in np.setdiff1d(np.flatnonzero(HARMONICS.at_most * size > size[r]), base):
+        for times, of_base in ((1, f"mode {base + 1}"), (2, f"2 × mode {base + 1}")):
+            for sign, word in ((1.0, "plus"), (-1.0, "less")):
+                frequency = abs(poles[other].imag + sign * times * own.imag)
                 rate = times * own.real + poles[other].real
-                of_base = f"{times} × mode {base + 1}" if times > 1 else f"mode {base + 1}"
-                words = f"mode {other + 1} {'plus' if sign > 0 else 'less'} {of_base}"
-                yield words, complex(rate, abs(poles[other].imag + sign * times * own.imag)), times
+                yield f"mode {other + 1} {word} {of_base}", complex(rate, frequency), times
 
 
 def _agrees(pole: complex, overtone: complex, scatter: float, deviation: complex) -> bool:
     """Whether a pole agrees with that of an overtone in frequency and in decay rate."""
-    frequency = OVERTONES.within * overtone.imag + OVERTONES.scatters * scatter + OVERTONES.sure * deviation.imag
-    decay = OVERTONES.damping * abs(overtone.real) + OVERTONES.sure * deviation.real
+    frequency = HARMONICS.within * overtone.imag + HARMONICS.scatters * scatter + SURE * deviation.imag
+    decay = HARMONICS.damping * abs(overtone.real) + SURE * deviation.real
     return abs(pole.imag - overtone.imag) < frequency and abs(pole.real - overtone.real) < decay

@@ -251,32 +251,29 @@ def rounded(value: float, error: float) -> tuple[str, str]:
 
 
 def credible(modes: SampledModes, omega_std: np.ndarray, zeta_std: np.ndarray, nyquist: float) -> np.ndarray:
-    """Which estimates can be modes, (n_modes,): no significantly negative damping, a significant frequency below
-    Nyquist.
-
-    Args:
-        modes: estimates.
-        omega_std, zeta_std: (n_modes,) standard errors.
-        nyquist: frequency, rad/s.
-    """
+    """Which estimates can be modes, (n_modes,): damping not significantly negative, a significant frequency below
+    Nyquist's, rad/s."""
     growing = modes.zeta < -SURE * zeta_std
     return np.asarray(~growing & (omega_std < modes.omega) & (modes.omega < nyquist))
 
 
 def repeated_remarks(estimates: ModalEstimates) -> tuple[str, ...]:
     """A remark on neighbours of equal frequency and damping within their errors: a repeated root."""
-    modes, pairs = estimates.modes, []
-    for r in range(modes.n_modes - 1):
-        differences = np.abs(np.diff([modes.omega[r : r + 2], modes.zeta[r : r + 2]], axis=1)).ravel()
-        errors = np.hypot(*np.array([estimates.omega_std[r : r + 2], estimates.zeta_std[r : r + 2]]).T)
-        if (differences < SURE * errors).all() and differences[0] < modes.zeta[r] * modes.omega[r]:
-            pairs.append(f"{r + 1} and {r + 2} ({modes.frequencies_hz[r]:.4g} Hz)")
+    modes, std = estimates.modes, np.array([estimates.omega_std, estimates.zeta_std])
+    differences = np.abs(np.diff([modes.omega, modes.zeta], axis=1))
+    equal = (differences < SURE * np.hypot(std[:, :-1], std[:, 1:])).all(axis=0)
+    pairs = _neighbours(modes, equal & (differences[0] < (modes.zeta * modes.omega)[:-1]))
     if not pairs:
         return ()
     return (
-        f"modes {', '.join(pairs)} may be one repeated root: only the plane of their two shapes is determined; each"
-        " shape is one of many in that plane, and need not be real",
+        f"modes {pairs} may be one repeated root: only the plane of their two shapes is determined; each shape is one"
+        " of many in that plane, and need not be real",
     )
+
+
+def _neighbours(modes: SampledModes, which: np.ndarray) -> str:
+    """Pairs of a mode and the next one, in words, where that is so by flag (n_modes - 1,)."""
+    return ", ".join(f"{r + 1} and {r + 2} ({modes.frequencies_hz[r]:.4g} Hz)" for r in np.flatnonzero(which).tolist())
 
 
 def set_up_remarks(estimates: ParticipatingModes) -> tuple[str, ...]:
@@ -285,18 +282,17 @@ def set_up_remarks(estimates: ParticipatingModes) -> tuple[str, ...]:
     Roving sensors load the structure at other places in each set-up and so shift its frequencies. Two different modes
     that an input excites would both be seen by a sensor near that input.
     """
-    modes, pairs = estimates.modes, []
-    shapes, inputs = np.abs(modes.shapes.T), np.abs(estimates.participation)
-    shapes, inputs = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in (shapes, inputs))
-    for r in range(modes.n_modes - 1):
-        near = np.ptp(modes.omega[r : r + 2]) < NEAR * modes.omega[r]
-        if near and shapes[r] @ shapes[r + 1] < APART and inputs[r] @ inputs[r + 1] > ALIKE:
-            pairs.append(f"{r + 1} and {r + 2} ({modes.frequencies_hz[r]:.4g} Hz)")
+    moduli = np.abs(estimates.modes.shapes.T), np.abs(estimates.participation)
+    units = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in moduli)
+    of_shapes, of_inputs = (np.array([a @ b for a, b in zip(unit, unit[1:])]) for unit in units)
+    omega = estimates.modes.omega
+    near = np.abs(np.diff(omega)) < NEAR * omega[:-1]
+    pairs = _neighbours(estimates.modes, near & (of_shapes < APART) & (of_inputs > ALIKE))
     if not pairs:
         return ()
     return (
-        f"modes {', '.join(pairs)} share no sensor: one mode, measured in two set-ups that load the structure"
-        " differently? Then neither has its whole shape, and modal masses are wrong: identify each set-up alone",
+        f"modes {pairs} share no sensor: one mode, measured in two set-ups that load the structure differently? Then"
+        " neither has its whole shape, and modal masses are wrong: identify each set-up alone",
     )
 
 
@@ -312,31 +308,19 @@ def by_poles(poles: np.ndarray) -> np.ndarray:
 
 
 def check_level(level: float) -> None:
-    """Refuse a confidence level outside 0..1.
-
-    Raises:
-        ValueError: such a level.
-    """
+    """Refuse a confidence level outside 0..1, by a ValueError."""
     if not 0.0 < level < 1.0:
         raise ValueError(f"the level of a confidence interval or band lies between 0 and 1; got {level}")
 
 
 def check_placed(sampled: SampledModes) -> None:
-    """Refuse a sensor without a place.
-
-    Raises:
-        ValueError: naming it, from 1.
-    """
+    """Refuse a sensor without a place, by a ValueError that names it, from 1."""
     if sampled.without_position.any():
         raise ValueError(f"sensor {int(np.argmax(sampled.without_position)) + 1} has no place; give its channel `at`")
 
 
 def check_finite(shapes: np.ndarray) -> None:
-    """Refuse shapes (n_sensors, n_modes) with an entry that is not finite.
-
-    Raises:
-        ValueError: naming mode and sensor, from 1.
-    """
+    """Refuse shapes (n_sensors, n_modes) with an entry that is not finite, by a ValueError."""
     if not np.isfinite(shapes).all():
         i, r = np.argwhere(~np.isfinite(shapes))[0]
         raise ValueError(f"shapes must be finite; of mode {r + 1} sensor {i + 1} has {shapes[i, r]}: leave it out")
@@ -345,8 +329,7 @@ def check_finite(shapes: np.ndarray) -> None:
 def normalised_shapes(shapes: np.ndarray) -> np.ndarray:
     """Shapes rotated to be most nearly real, largest entry 1, the first entry of over 0.05 positive.
 
-    Raises:
-        ValueError: an entry that is not finite, a shape that is zero at all sensors.
+    A ValueError refuses an entry that is not finite, and a shape that is zero at all sensors.
     """
     check_finite(shapes)
     still = ~np.any(shapes, axis=0)

@@ -65,12 +65,9 @@ PROJECTION = ProjectionSettings()
 def pole_blocks(a: np.ndarray, b: np.ndarray, gram: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[Floats, Floats]:
     """Gauss-Newton matrix (2 n, 2 n) and right-hand side (2 n,) for the real, then imaginary parts of n poles.
 
-    Outputs are Re Σ (a - ib) z; the tangents ∂z are projected orthogonally to the columns of the fit.
-
-    Args:
-        a, b: (n, n_outputs) cosine and sine amplitudes, in units of the noise.
-        gram: (2 n, 2 n) Gram matrix of the real, then imaginary parts of the projected tangents.
-        x, y: (n, n_outputs) products of these with the residual, in units of the noise.
+    Outputs are Re Σ (a - ib) z, a and b (n, n_outputs) in units of the noise. `gram` (2 n, 2 n) is the Gram matrix of
+    the real, then imaginary parts of the tangents ∂z projected orthogonally to the columns of the fit; x and y
+    (n, n_outputs) are products of these with the residual, in units of the noise.
     """
     n = len(a)
     aa, ab, bb = a @ a.T, a @ b.T, b @ b.T
@@ -134,16 +131,11 @@ def project(record: Record, poles: np.ndarray, offset: bool) -> Projection:
 
 
 class _Rows:
-    """Φ, tΦ, a constant and y compressed to fewer rows with the same inner products.
+    """Φ, tΦ (n_rows, 2 n_modes), the constant `level` and y (n_rows, n_outputs), in fewer rows of equal inner products.
 
     The exponentials of a block that begins at T are e^{λT} e^{λτ}: in every block they lie in the span of one table,
     [e^{λτ}, τ e^{λτ}, 1] = Q R. Each block is represented by its coordinates along Q; the part of y orthogonal to Q is
     orthogonal to every column.
-
-    Attributes:
-        phi, t_phi: (n_rows, 2 n_modes).
-        level: (n_rows,) of the constant.
-        y: (n_rows, n_outputs).
     """
 
     def __init__(self, record: Record, poles: np.ndarray) -> None:
@@ -187,7 +179,8 @@ def power_sums(w: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarra
         if bit == "1":
             sums = [total + float(length) ** k * power for k, total in enumerate(sums)]
             power, length = power * w, length + 1
-    return sums[0], sums[1], sums[2]
+    s0, s1, s2 = sums
+    return s0, s1, s2
 
 
 def _exponentials(n: int, sample_time: float, poles: np.ndarray) -> np.ndarray:
@@ -206,16 +199,16 @@ def _grams(poles: np.ndarray, record: Record, offset: bool) -> tuple[np.ndarray,
     """The matrices ΦᵀΦ and ΦᵀtΦ, with `offset` including the constant in Φ, and (tΦ)ᵀtΦ."""
     mu, n, dt = np.exp(poles * record.sample_time), record.n_samples, record.sample_time
     same, turned = power_sums(np.outer(mu, mu), n), power_sums(np.outer(mu, mu.conj()), n)
-    grams = []
-    for k, (q, p) in enumerate(zip(same, turned, strict=True)):
-        blocks = [[(p + q).real, (q - p).imag], [(q + p).imag, (p - q).real]]
-        grams.append(0.5 * dt**k * np.block(blocks))
-    if not offset:
-        return grams[0], grams[1], grams[2]
-    s0, s1, _ = power_sums(mu, n)
-    level, rising = np.r_[s0.real, s0.imag], dt * np.r_[s1.real, s1.imag]
-    whole = np.block([[grams[0], level[:, None]], [level[None], np.array([[float(n)]])]])
-    return whole, np.vstack([grams[1], rising]), grams[2]
+    whole, tilted, doubly = (
+        0.5 * dt**k * np.block([[(p + q).real, (q - p).imag], [(q + p).imag, (p - q).real]])
+        for k, (q, p) in enumerate(zip(same, turned, strict=True))
+    )
+    if offset:
+        s0, s1, _ = power_sums(mu, n)
+        level, rising = np.r_[s0.real, s0.imag], dt * np.r_[s1.real, s1.imag]
+        whole = np.block([[whole, level[:, None]], [level[None], np.array([[float(n)]])]])
+        tilted = np.vstack([tilted, rising])
+    return whole, tilted, doubly
 
 
 def _project_by_parts(record: Record, poles: np.ndarray, offset: bool) -> Projection:
@@ -283,7 +276,8 @@ class _Exponentials:
             level, rising = inner[:, :, 0], inner[:, :, 1] + begin[:, None] * inner[:, :, 0]
             for total, each in zip(totals, (level, rising), strict=True):
                 total[self.order[: far.shape[1]]] += np.einsum("jbr,br->rj", each, far)
-        return np.concatenate([totals[0].real, totals[0].imag]), np.concatenate([totals[1].real, totals[1].imag])
+        phi_y, t_phi_y = (np.concatenate([total.real, total.imag]) for total in totals)
+        return phi_y, t_phi_y
 
     def motion(self, amplitudes: Complexes) -> Floats:
         """The motion Re Σ_r a_jr e^{λ_r t} of amplitudes (n_outputs, n_modes), (n_samples, n_outputs)."""
@@ -298,14 +292,10 @@ class _Exponentials:
 
 
 def whitened(records: Sequence[Record], poles: np.ndarray) -> list[Record] | None:
-    """The records filtered so that the residual of `poles` becomes white; None where it may be white.
+    """The free decays filtered so that the residual of `poles`, rad/s, becomes white; None where it may be white.
 
     Correlated noise, such as vibration of the whole bench, would count once per output, and its peaks would be taken
     for modes. Outputs are therefore first replaced by combinations of uncorrelated noise, each with its own filter.
-
-    Args:
-        records: free decays of the same outputs.
-        poles: (n_modes,) of their modes, rad/s.
     """
     residuals = [project(record, poles, True).residual.T for record in records]
     order = min(PROJECTION.order, sum(each.shape[1] for each in residuals) // PROJECTION.samples_each)
@@ -337,14 +327,9 @@ def whitened(records: Sequence[Record], poles: np.ndarray) -> list[Record] | Non
 
 
 def correlation(residuals: Sequence[np.ndarray]) -> Floats | None:
-    """Correlation matrix of the noise of outputs over all records, (n_outputs, n_outputs); None if not significant.
-
-    Args:
-        residuals: (n_outputs, n_samples) of each record.
-    """
-    if len(residuals[0]) == 1:
-        return None
-    return correlation_of_lines([_lines_of(each) for each in residuals])
+    """Correlation matrix of the noise of outputs, (n_outputs, n_outputs), from residuals (n_outputs, n_samples) of each
+    record; None if not significant."""
+    return None if len(residuals[0]) == 1 else correlation_of_lines([_lines_of(each) for each in residuals])
 
 
 def _lines_of(signals: np.ndarray) -> Complexes:
@@ -360,14 +345,11 @@ def _lines_of(signals: np.ndarray) -> Complexes:
 
 
 def correlation_of_lines(lines: Sequence[np.ndarray]) -> Floats | None:
-    """Correlation matrix of the noise of outputs, (n_outputs, n_outputs), from Fourier lines; None if not significant.
+    """`correlation` from Fourier lines of the residual of each record, (n_outputs, n_lines).
 
     It is the median over bands, so that modes not found yet do not count as noise. Bartlett's test of sphericity
     (Proc. Camb. Phil. Soc. 47, 1951): for N values of m outputs -(N - (2 m + 5)/6) ln det C is chi-square with
     m (m - 1)/2 degrees of freedom.
-
-    Args:
-        lines: (n_outputs, n_lines) complex, of the residual of each record.
     """
     m, size = len(lines[0]), 2 * sum(each.shape[1] for each in lines)
     if m == 1 or min(each.shape[1] for each in lines) < PROJECTION.band or size < PROJECTION.samples_each * m:
@@ -403,9 +385,7 @@ def _median_correlation(lines: Sequence[np.ndarray]) -> Floats:
 def disturbed(shared: Floats | None, amplitudes: np.ndarray) -> Floats:
     """Variance of each mode in correlated noise over that in uncorrelated noise, a^H C a / a^H a, (n_modes,).
 
-    Args:
-        shared: correlation matrix C of the noise (n_outputs, n_outputs); None where it is uncorrelated.
-        amplitudes: a (n_outputs, n_modes), over the noise of each output.
+    From the correlation matrix C, None where noise is uncorrelated, and a (n_outputs, n_modes) over the noise.
     """
     if shared is None:
         return np.ones(amplitudes.shape[1])
@@ -414,26 +394,18 @@ def disturbed(shared: Floats | None, amplitudes: np.ndarray) -> Floats:
 
 
 def mixing_of(shared: Floats | None) -> Floats | None:
-    """Combinations (n_outputs, n_outputs) of outputs, over their noise, in which it is uncorrelated; None where it is
-    uncorrelated already.
+    """Combinations (n_outputs, n_outputs) of outputs, over their noise, in which it is uncorrelated; None if it is.
 
-    Args:
-        shared: correlation matrix of the noise, or None.
+    From its correlation matrix, or None.
     """
     return None if shared is None else np.linalg.inv(np.linalg.cholesky(shared))
 
 
 def independent(records: Sequence[Record], residuals: Sequence[np.ndarray]) -> tuple[list[Record], list[Floats]] | None:
-    """Records of combinations of the outputs whose noise is uncorrelated and of unit variance, and their residuals.
+    """Records of combinations of the outputs whose noise is uncorrelated and of unit variance, and their residuals
+    (n_outputs, n_samples); None where correlation of the noise is not significant.
 
     A free decay stays a free decay of the same poles.
-
-    Args:
-        records: of the same outputs.
-        residuals: (n_outputs, n_samples) of each.
-
-    Returns:
-        None where correlation of the noise is not significant.
     """
     whitening = mixing_of(correlation(residuals))
     if whitening is None:
@@ -446,11 +418,7 @@ def independent(records: Sequence[Record], residuals: Sequence[np.ndarray]) -> t
 def noise_near(poles: np.ndarray, residual: np.ndarray, noise: np.ndarray, sample_time: float) -> np.ndarray:
     """Ratio κ of the noise power about each mode to its mean, (n_outputs, n_modes); 1 where the noise may be white.
 
-    Args:
-        poles: (n_modes,) of the fitted modes, rad/s.
-        residual: (n_samples, n_outputs).
-        noise: (n_outputs,) standard deviation of the residual.
-        sample_time: s.
+    From poles, rad/s, and the residual (n_samples, n_outputs) of standard deviation `noise` (n_outputs,).
     """
     n, m = residual.shape
     bin_width = 2.0 * np.pi / (n * sample_time)
@@ -472,12 +440,7 @@ def noise_near(poles: np.ndarray, residual: np.ndarray, noise: np.ndarray, sampl
 def local_noise_ratio(power: Floats, nearest: int, half_width: int) -> float:
     """Noise power about a line over its mean, by the median of the lines near it; 1 at least, and where none is near.
 
-    The median of a power with two or more degrees of freedom is at most its mean.
-
-    Args:
-        power: (n_lines,) of the residual.
-        nearest: index of the line, which may lie outside.
-        half_width: number of lines near it on either side.
+    The median of a power with two or more degrees of freedom is at most its mean. The line `nearest` may lie outside.
     """
     around = power[max(nearest - half_width, 0) : nearest + half_width + 1]
     return max(1.0, float(np.median(around) / power.mean())) if around.size else 1.0
@@ -507,10 +470,7 @@ def noise_along(signals: np.ndarray, residual: np.ndarray, n_modes: int) -> np.n
     """Ratio κ of the noise power in the spectrum of each signal to its mean, (n_signals, n_outputs); 1 where the noise
     may be white.
 
-    Args:
-        signals: (n_samples, n_signals).
-        residual: (n_samples, n_outputs) of a fit, over its standard deviation.
-        n_modes: of the fit.
+    From signals (n_samples, n_signals) and the residual (n_samples, n_outputs) of a fit, over its standard deviation.
     """
     columns = residual / np.sqrt(len(residual)), signals
     power, weight = (np.abs(np.fft.rfft(each, axis=0)[1:]) ** 2 for each in columns)
@@ -529,10 +489,7 @@ def _bandwidth_weight(distance: np.ndarray) -> np.ndarray:
 def white(power: np.ndarray, n_modes: int, *, among: int | None = None) -> np.ndarray:
     """Which outputs may have white noise, (n_outputs,): test of the cumulative periodogram (Bartlett; Kolmogorov).
 
-    Args:
-        power: (n_bins, n_outputs) periodogram of the residual.
-        n_modes: number of modes of the fit.
-        among: number of outputs tested in all; those of `power` unless given.
+    From the periodogram (n_bins, n_outputs) of the residual; `among` is the number of outputs tested in all.
     """
     bins, m = power.shape
     total = power.sum(axis=0)
@@ -557,11 +514,7 @@ def variances(squares: np.ndarray, free: np.ndarray, apart: np.ndarray | None = 
 
 
 def differ(squares: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Which outputs differ in noise variance between records, (n_outputs,), by Bartlett's test.
-
-    Args:
-        squares, free: as of `variances`.
-    """
+    """Which outputs differ in noise variance between records, (n_outputs,), by Bartlett's test; see `variances`."""
     n, free = len(squares), _per_output(free, squares)
     if n == 1:
         return np.zeros(squares.shape[1], bool)

@@ -30,8 +30,7 @@ SECONDS = 30.0  # processor time limit
 WHOLE = 0.995  # share of the time from which on a search counts as ended by the limit as a whole
 FURTHER = "search for further modes"
 STOPPED = "stopped after"  # first words of the remark on an exceeded time limit
-# Probability that a record of noise alone yields a mode.
-FALSE_ALARM = 1e-3
+FALSE_ALARM = 1e-3  # probability that a record of noise alone yields a mode
 
 
 @dataclass(frozen=True)
@@ -59,6 +58,7 @@ class SelectionSettings:
     same_shape: float = 0.95  # MAC from which on two overlapping poles are one mode, split
     most_rounds: int = 4  # in coloured noise, or with amplitude dependence, modes might enter and leave for ever
     few_steps: int = 12  # of a fit that only decides whether a mode enters or leaves
+    decided: float = 0.1  # decrease of χ², expected of a further step per value, below which such a fit ends
     weak: float = 4.0  # times the threshold, below which a mode may be noise and is tested again
     close: float = 2.0  # bandwidths to the next mode, likewise
     noise_bins: int = 50  # on either side of a pole, from which the noise about it is estimated
@@ -78,9 +78,7 @@ Progress = Callable[[str, float], None]
 class TimeLimit(Deadline):
     """A limit of processor time for an identification, and the searches that it ended early.
 
-    Attributes:
-        progress: called with the search under way and the share of the time that is spent.
-        unfinished: name of each search that was ended early, and the share of the whole time that had passed then.
+    `unfinished` holds the name of each search that was ended early, and the share of the whole time that had passed.
     """
 
     def __init__(self, seconds: float | None = None, progress: Progress | None = None) -> None:
@@ -153,11 +151,7 @@ DAMPING = DampingSettings()
 
 
 def check_count(name: str, number: int | None) -> None:
-    """Refuse a number of modes below one.
-
-    Raises:
-        ValueError: naming it.
-    """
+    """Refuse a number of modes below one, by a ValueError that names it."""
     if number is not None and number < 1:
         raise ValueError(f"{name} is a number of modes, 1 or more; got {number}")
 
@@ -167,31 +161,20 @@ class LeastSquares(Protocol[State]):
 
     def cost(self, state: State) -> float:
         """The function that is minimised; infinite where the state is not admissible."""
-        ...
 
     def normal_equations(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """N (n_unknowns, n_unknowns), half the Hessian or near it, and g (n_unknowns,), half the negative gradient."""
-        ...
 
     def moved(self, state: State, step: np.ndarray) -> tuple[State | None, np.ndarray]:
         """The state after a step, None where it is not admissible, and the part of the step that was taken."""
-        ...
 
     def negligible(self, decrease: float, cost: float) -> bool:
         """Whether a step of this predicted decrease of the cost may be the last."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
 class Minimum(Generic[State]):
-    """The result of `minimise`.
-
-    Attributes:
-        state: of least cost.
-        cost: of this state.
-        converged: whether the search ended because the step was negligible.
-        steps: number of steps.
-    """
+    """The state of least cost, its cost, whether the last step was negligible, and the number of steps."""
 
     state: State
     cost: float
@@ -208,14 +191,10 @@ def minimise(
     time_limit: TimeLimit | None = None,
     is_vain: Callable[[State], bool] = lambda state: False,
 ) -> Minimum[State]:
-    """The local minimum of a problem next to `start`.
+    """The local minimum of a problem next to `start`, an admissible state.
 
     Args:
-        problem: see `LeastSquares`.
-        start: admissible.
-        most_steps: largest number of steps.
         round_off: of the cost; a step that raises it by no more is accepted.
-        time_limit: of processor time; none unless given.
         is_vain: whether a state ends the search, since what follows from it is of no use.
     """
     state, cost, damping, small = start, problem.cost(start), DAMPING.first, False
@@ -246,10 +225,6 @@ def minimise(
     return Minimum(state, cost, False, most_steps)
 
 
-Model = TypeVar("Model")
-Candidate = TypeVar("Candidate")
-
-
 class CachedResidual:
     """A function for the residual (n,) and its Jacobian (n, n_unknowns) that keeps its last value.
 
@@ -270,6 +245,28 @@ class CachedResidual:
         return np.asarray(least_squares(residual, start, jacobian, x_scale="jac", max_nfev=most_tries, **options).x)
 
 
+def projected_residual(
+    values: Floats, columns: Floats, tangents_of: Callable[[Floats], Floats]
+) -> tuple[Floats, Floats]:
+    """Residual of values (n,) with columns (n, k) projected out, and its Jacobian (n, n_unknowns) (Kaufman 1975).
+
+    `tangents_of` gives the changes of the columns with the unknowns, times given coefficients (k,) of the columns.
+    """
+    q, r = np.linalg.qr(columns)
+    along = q.T @ values
+    tangents = tangents_of(np.linalg.lstsq(r, along, rcond=1e-12)[0])
+    return np.asarray(values - q @ along), np.asarray(q @ (q.T @ tangents) - tangents)
+
+
+def diverged(values: Floats, n_unknowns: int) -> tuple[Floats, Floats]:
+    """In place of `projected_residual` where a motion diverges: a large residual that no unknown changes."""
+    return 10.0 * np.abs(values), np.zeros((values.size, n_unknowns))
+
+
+Model = TypeVar("Model")
+Candidate = TypeVar("Candidate")
+
+
 class Selection(Protocol[Model, Candidate]):
     """A measurement for `OrderSelection`; a model is a fitted set of modes, a candidate a mode that may enter it."""
 
@@ -277,62 +274,42 @@ class Selection(Protocol[Model, Candidate]):
 
     def strongest(self, model: Model, rejected: list[tuple[complex, float]]) -> Candidate | None:
         """The candidate most likely to be a further mode; None where the residual of the model is noise."""
-        ...
 
     def pole_of(self, candidate: Candidate) -> complex: ...
 
     def extended(self, model: Model, candidate: Candidate) -> Model:
         """The model with one more mode, all fitted again; LinAlgError where they cannot be distinguished."""
-        ...
 
     def gain(self, smaller: Model, larger: Model) -> float:
         """Twice the log-likelihood ratio of two models."""
-        ...
 
     def threshold(self, model: Model, pole: complex) -> float:
         """The gain by a mode at this pole that noise exceeds with the probability of a false alarm."""
-        ...
 
     def splits(self, model: Model, trial: Model) -> bool:
         """Whether the mode that a trial adds splits a mode of the model in two, or is spurious."""
-        ...
 
     def settled(self, model: Model) -> Model:
         """The model fitted to convergence."""
-        ...
 
     def suspects(self, model: Model) -> Iterable[tuple[complex, Model, bool]]:
         """Modes to test: the pole of each, the model without it, and whether it is certainly spurious."""
-        ...
 
 
 @dataclass
 class OrderSelection(Generic[Model, Candidate]):
-    """Stepwise selection of modes, forward and backward.
+    """Stepwise selection of modes, forward and backward."""
 
-    Attributes:
-        problem: see `Selection`.
-        max_modes: largest number of modes.
-        most_weak: number of consecutive candidates below the threshold at which the forward search ends.
-        most_splits: number of candidates that split a mode at which it ends; None to count these as weak.
-        forgets: whether a rejected candidate may be tried again once another mode has entered.
-        time_limit: of processor time.
-        alone: whether the whole time is for this selection.
-        rejected: poles tried and rejected, with their gain.
-        full: whether the selection stopped at `max_modes`.
-        cut_short: whether the time limit ended the last forward search.
-    """
-
-    problem: Selection[Model, Candidate]
-    max_modes: float
-    most_weak: float
-    most_splits: int | None
-    forgets: bool
-    time_limit: TimeLimit = field(default_factory=TimeLimit)
-    alone: bool = False
-    rejected: list[tuple[complex, float]] = field(default_factory=list)
-    full: bool = False
-    cut_short: bool = False
+    problem: Selection[Model, Candidate]  # see `Selection`
+    max_modes: float  # largest number of modes
+    most_weak: float  # number of consecutive candidates below the threshold at which the forward search ends
+    most_splits: int | None  # number of candidates that split a mode at which it ends; None to count these as weak
+    forgets: bool  # whether a rejected candidate may be tried again once another mode has entered
+    time_limit: TimeLimit = field(default_factory=TimeLimit)  # of processor time
+    alone: bool = False  # whether the whole time is for this selection
+    rejected: list[tuple[complex, float]] = field(default_factory=list)  # poles tried and rejected, with their gain
+    full: bool = False  # whether the selection stopped at `max_modes`
+    cut_short: bool = False  # whether the time limit ended the last forward search
 
     def select(self, model: Model) -> Model:
         """The model after forward and backward selection, starting from `model`."""
@@ -359,16 +336,18 @@ class OrderSelection(Generic[Model, Candidate]):
         own_limit = self.time_limit.share(SELECTION.forward_share)
         if self.cut_short:
             self.time_limit.unfinished.pop(FURTHER, None)
-            self.cut_short = False
+        self.cut_short = False
         if self.forgets:
             self.rejected.clear()
         while (
             self.problem.n_modes(model) < self.max_modes
             and weak < self.most_weak
             and (self.most_splits is None or splits < self.most_splits)
-            # The first mode is searched whatever the time.
-            and not (self.problem.n_modes(model) and self._ends(own_limit))
         ):
+            # The first mode is searched whatever the time.
+            if self.problem.n_modes(model) and own_limit.spent(FURTHER):
+                self.cut_short = True
+                break
             candidate = self.problem.strongest(model, self.rejected)
             if candidate is None:
                 break
@@ -390,11 +369,6 @@ class OrderSelection(Generic[Model, Candidate]):
                 continue
             self.rejected.append((complex(pole), gain))
         return model
-
-    def _ends(self, own_limit: TimeLimit) -> bool:
-        """Whether the time of the forward search is up; sets `cut_short`."""
-        self.cut_short = own_limit.spent(FURTHER)
-        return self.cut_short
 
     def backward(self, model: Model) -> Model:
         """The model without modes of insignificant gain; the weakest goes first."""
@@ -429,16 +403,13 @@ def spurious_modes(
     """Which poles are overdamped, or split off a stronger mode of the same shape in the same band, (n_modes,).
 
     Args:
-        poles: (n_modes,) rad/s.
         shapes: (n_signals, n_modes) amplitudes over the noise, complex.
-        strength: (n_modes,); of two poles of one mode the weaker is spurious.
         bin_width: rad/s, the frequency resolution of the record.
         distinct: test whether modes r and s are two modes, for a single signal, which shows no shape.
     """
     band = np.abs(poles.real)[:, None] + np.abs(poles.real) + bin_width
     near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < band
-    damped = overdamped(poles)
-    # No mode splits off an overdamped pole, whose band is wide enough for any.
+    damped = overdamped(poles)  # no mode splits off such a pole, whose band is wide enough for any
     # A single signal shows no shape, and a mode that depends on amplitude looks like two there.
     others = len(shapes) - 1
     least_mac = max(SELECTION.same_shape, 1.0 - BY_CHANCE ** (1.0 / others)) if others else SELECTION.same_shape
