@@ -99,18 +99,12 @@ def law_arrays(rig: Rig) -> Elements:
 
 
 @njit(cache=True, nogil=True)
-def spread_forces(
-    q: Floats,
-    v: Floats,
-    stretch: float,
-    stretching: Floats,
-    drag_shapes: Floats,
-    drag_weights: Floats,
-    push: Floats,
-    coupling: Floats,
-    out: Floats,
-) -> None:
-    """Fill the modal forces (n_modes,) of stretching, drag and damping that couples modes; push is a work array."""
+def spread_forces(q: Floats, v: Floats, along: Along, out: Floats) -> None:
+    """Fill the modal forces (n_modes,) of stretching, drag and damping that couples modes.
+
+    `along` holds their arrays, see `structure_arrays`, with a work array (n_points,) before the coupling.
+    """
+    stretch, stretching, drag_shapes, drag_weights, push, coupling = along
     n = q.size
     out[:] = 0.0
     if stretch != 0.0:
@@ -184,7 +178,7 @@ def _advance_once(
     e, aw, av = linear
     drive, drive_end, more_q, more_v = drives
     kinds, shapes, parameters = elements
-    stretch, stretching, drag_shapes, drag_weights, push, coupling = along
+    stretch, _, _, drag_weights, _, coupling = along
     q, v, old = motion
     point, earlier, w_old, z = points
     w_free, v_free, base_q, base_v, new, spread = work
@@ -209,7 +203,7 @@ def _advance_once(
         for i in range(n_elements):
             w_free[i], v_free[i] = row_times(shapes, i, q), row_times(shapes, i, v)
         if n_elements > 0:
-            solve_laws(kinds, parameters, w_free, v_free, aw, av, z, w_old, point)
+            solve_laws((kinds, parameters), w_free, v_free, aw, av, z, w_old, point)
         for r in range(n):
             new[r] = spread[r]
         for i in range(n_elements):
@@ -221,7 +215,7 @@ def _advance_once(
             v[r] = base_v[r] + e[1, 3, r] * new[r]
         if distributed and sweep == 0:
             # distributed forces, from the predicted motion
-            spread_forces(q, v, stretch, stretching, drag_shapes, drag_weights, push, coupling, spread)
+            spread_forces(q, v, along, spread)
     for r in range(n):
         old[r] = new[r]
     for i in range(n_elements):
