@@ -83,11 +83,7 @@ def read_rig(path: str | Path) -> Rig:
 
 
 def rig_of(table: dict[str, Any], path: Path) -> Rig:
-    """The rig that the tables of a file describe.
-
-    Raises:
-        CaseError: naming the file, the key, the value, and what would be right.
-    """
+    """The rig that the tables of a file describe; see `read_rig`."""
     check_keys(table, TABLES, str(path))
     inputs, outputs = tables(table, "input", path), tables(table, "output", path)
     names = [entry["name"] for entry in (*inputs, *outputs)]
@@ -111,9 +107,8 @@ def rig_of(table: dict[str, Any], path: Path) -> Rig:
         if structure.get("kind") == "modal":
             return _modal_rig(structure, inputs, outputs, path)
         units = table.get("units")
-        return _member_rig(
-            structure, inputs, outputs, str(units.get("length", "m") if isinstance(units, dict) else "m")
-        )
+        unit = units.get("length", "m") if isinstance(units, dict) else "m"
+        return _member_rig(structure, inputs, outputs, str(unit))
     except (ValueError, TypeError, ArithmeticError) as error:
         raise CaseError(f"{path}: {error}") from error
 
