@@ -28,12 +28,7 @@ R = TypeVar("R")
 
 
 def actuator_force(actuator: Actuator, command: np.ndarray) -> np.ndarray:
-    """The static force of an actuator: hysteresis, gain, dead zone, saturation, before rate limit, delay and lag.
-
-    Args:
-        actuator: of the force.
-        command: (n_samples,) with its cross-talk.
-    """
+    """The static force (n_samples,) of a command with its cross-talk: hysteresis, gain, dead zone and saturation."""
     if actuator.hysteresis_share:
         share = actuator.hysteresis_share
         hysteretic = hysteresis(np.r_[0.0, command], actuator.hysteresis_width)[1:]
@@ -154,9 +149,7 @@ class _Inputs:
         return isinstance(other, _Inputs) and self.values is other.values
 
 
-def cached_for_records(
-    function: Callable[Concatenate[Floats, int, P], R],
-) -> Callable[Concatenate[Floats, int, P], R]:
+def cached_for_records(function: Callable[Concatenate[Floats, int, P], R]) -> Callable[Concatenate[Floats, int, P], R]:
     """A function of inputs and of steps per sample that is cached for the inputs of a record, which are read-only.
 
     Structure and sensors of a rig change more often.
@@ -268,11 +261,7 @@ def _delayed_and_lagged(
 def sinusoid_on_substeps(
     element: PeriodicForce, n_samples: int, sample_time: float, substeps: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A sinusoid's linear replacement over each substep, of the same mean and first moment, and its values at samples.
-
-    Returns:
-        Starts and ends (n_samples * substeps,), and values (n_samples,).
-    """
+    """Starts and ends (n_samples * substeps,) of a sinusoid's linear replacement, and its values (n_samples,)."""
     omega, h = 2 * np.pi * element.frequency_hz, sample_time / substeps
     edges = omega * h * np.arange(n_samples * substeps + 1) + element.phase
     middle, half = 0.5 * (edges[:-1] + edges[1:]), 0.5 * omega * h

@@ -170,12 +170,7 @@ def _steps_within(
 ) -> tuple[Step, ...]:
     """Steps of the modal forces within each sample interval, of held inputs that are delayed or lagged.
 
-    Args:
-        rig: has the actuators.
-        inputs: (n_actuators, n_samples) commands with cross-talk.
-        acting: (n_actuators, n_samples) forces at the samples, without bias.
-        participation: (n_modes, n_actuators or more).
-        sample_time: s.
+    `inputs` are commands with cross-talk, `acting` the forces at the samples without bias, (n_actuators, n_samples).
     """
     steps: dict[tuple[float, float], Floats] = {}
     for j, actuator in enumerate(rig.actuators):
@@ -267,12 +262,7 @@ def prediction_errors(
 def _forces(
     rig: Rig, inputs: Floats, sample_time: float, substeps: int, input_hold: str
 ) -> tuple[Floats, Floats, Forces]:
-    """Forces of actuators and sinusoids.
-
-    Returns:
-        Participation (n_modes, n_forces), the forces at the samples (n_forces, n_samples), and for
-        `step_record` those that are ever other than zero.
-    """
+    """Participation (n_modes, n_forces) of actuators and sinusoids, their forces at samples and for `step_record`."""
     modes, h = rig.modes, sample_time / substeps
     drive, participation = drives(inputs, substeps, rig.actuators, sample_time, input_hold), participation_of(rig)
     driven, starts, ends, at_samples, courses, sizes = drive

@@ -8,8 +8,8 @@ import numpy as np
 
 from workbench.arrays import Floats
 from workbench.rig.actuators import Actuator, mixing
-from workbench.rig.rig import Transducer, shape_of
-from workbench.rig.sensors import MEASURED, Sensor
+from workbench.rig.rig import Transducer, shape_of, transducer_text
+from workbench.rig.sensors import MEASURED, Sensor, crosstalk_between
 from workbench.structure.modes import Modes
 from workbench.structure.printed import joined_in_words
 
@@ -88,16 +88,11 @@ def state_space(modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[S
 
 
 def _check_finite_linear(part: Transducer) -> None:
-    """Refuse an actuator or a sensor that no finite `StateSpace` represents.
-
-    Raises:
-        ValueError: with what it has, and the remedy.
-    """
+    """Refuse an actuator or a sensor that no finite `StateSpace` represents, by a `ValueError`."""
     if part.has_state_space:
         return
-    channel = f"{'actuator' if isinstance(part, Actuator) else 'sensor'} {part.name}"
-    ideal = replace(part, delay=0.0)
-    if ideal.has_state_space:
+    channel = transducer_text(part)
+    if replace(part, delay=0.0).has_state_space:
         raise ValueError(
             f"{channel} has a delay, which no finite StateSpace represents exactly; leave it out and connect an"
             " approximation by control.pade in series, or simulate the rig"
@@ -138,7 +133,9 @@ def modal_plant(
 
     c, d = read(sensors)
     if with_crosstalk and any(sensor.crosstalk for sensor in sensors):
-        share = _shares(sensors)
+        share = np.zeros((len(sensors), len(sensors)))
+        for j, i, part in crosstalk_between(sensors):
+            share[j, i] += sensors[j].gain * part
         more = read([replace(sensor, gain=1.0) for sensor in sensors])
         c, d = c + share @ more[0], d + share @ more[1]
     c, d = np.vstack([c, np.zeros((m, 2 * n))]), np.vstack([d, np.eye(m)])
@@ -160,21 +157,6 @@ def modal_plant(
     if any(actuator.crosstalk for actuator in actuators):
         b, d = b @ mixing(actuators), d @ mixing(actuators)
     return a, b, c, d, states
-
-
-def _shares(sensors: Sequence[Sensor]) -> Floats:
-    """Cross-talk as a matrix (n_sensors, n_sensors): the reading of each sensor per quantity that another measures.
-
-    Raises:
-        ValueError: a share of a sensor that is not among these.
-    """
-    names, shares = [sensor.name for sensor in sensors], np.zeros((len(sensors), len(sensors)))
-    for j, sensor in enumerate(sensors):
-        for name, share in sensor.crosstalk:
-            if name not in names:
-                raise ValueError(f"sensor {sensor.name} reads a share of {name!r}, which is no sensor of the rig")
-            shares[j, names.index(name)] += sensor.gain * share
-    return shares
 
 
 def _named(name: str, size: int) -> list[str]:

@@ -341,13 +341,7 @@ def at_rest(n: int, n_elements: int) -> tuple[Linear, Linear, Drives, Moving, Po
 
 @njit(cache=True, nogil=True)
 def step_record(
-    structure: Structure,
-    elements: Elements,
-    forces: Forces,
-    dt: float,
-    n_sub: int,
-    observer: Observer,
-    out: Out,
+    structure: Structure, elements: Elements, forces: Forces, dt: float, n_sub: int, observer: Observer, out: Out
 ) -> None:
     """Fill the motion of a rig from rest, or the innovations of an observer, which correct the motion.
 

@@ -1,8 +1,8 @@
 """Boundary conditions of a structure, and masses, springs and dampers attached to it."""
 
 from collections.abc import Iterable, Mapping
-from typing import TypeVar
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
