@@ -117,25 +117,6 @@ def _convolution(pole: Complexes, rate: float, power: int) -> Complexes:
     return np.where(near, series, (np.exp(pole) - 1.0 - pole) / x**2 if power else (np.exp(pole) - np.exp(-rate)) / x)
 
 
-class Drives(NamedTuple):
-    """Forces of the actuators over the substeps.
-
-    Attributes:
-        driven: (n_actuators,) which actuators ever exert a force.
-        starts, ends: (n_driven, n_samples * substeps) linear forces at the start and the end of each substep.
-        at_samples: (n_actuators, n_samples) forces at the samples.
-        courses: (actuator, course) of unit delayed or lagged forces, which are not linear.
-        sizes: (n_courses, n_samples * substeps) of these in each substep.
-    """
-
-    driven: Flags
-    starts: Floats
-    ends: Floats
-    at_samples: Floats
-    courses: tuple[tuple[int, Course], ...]
-    sizes: Floats
-
-
 class _Inputs:
     """A read-only array as a key of a cache, compared by identity."""
 
@@ -173,8 +154,14 @@ on_finer_steps = cached_for_records(finer)
 @cached_for_records
 def drives(
     inputs: Floats, substeps: int, actuators: tuple[Actuator, ...], sample_time: float, input_hold: str
-) -> Drives:
-    """The forces of the actuators over the substeps, for inputs (n_actuators, n_samples)."""
+) -> tuple[Flags, Floats, Floats, Floats, tuple[tuple[int, Course], ...], Floats]:
+    """The forces of the actuators over the substeps, for inputs (n_actuators, n_samples).
+
+    Returns:
+        Which actuators ever exert a force (n_actuators,); their linear forces at the start and at the end of each
+        substep (n_driven, n_samples * substeps); the forces at the samples (n_actuators, n_samples); and (actuator,
+        course) of unit delayed or lagged forces, which are not linear, with their sizes in each substep.
+    """
     h = sample_time / substeps
     mean = np.empty((inputs.shape[0], inputs.shape[1] * substeps))
     rise = np.zeros_like(mean)  # half of it, over a substep
@@ -213,7 +200,7 @@ def drives(
     sizes = np.array([size for *_, size in acting]).reshape(len(acting), mean.shape[1])
     driven = np.logical_or(starts.any(axis=1), ends.any(axis=1))
     of_acting = tuple((j, course) for j, course, _ in acting)
-    return Drives(driven, starts[driven], ends[driven], at_samples, of_acting, sizes)
+    return driven, starts[driven], ends[driven], at_samples, of_acting, sizes
 
 
 def _delayed_and_lagged(

@@ -263,8 +263,8 @@ def _forces(
     rig: Rig, inputs: Floats, sample_time: float, substeps: int, input_hold: str
 ) -> tuple[Floats, Floats, Forces]:
     """Participation (n_modes, n_forces) of actuators and sinusoids, their forces at samples and for `step_record`."""
-    modes, h = rig.modes, sample_time / substeps
-    drive, participation = drives(inputs, substeps, rig.actuators, sample_time, input_hold), participation_of(rig)
+    modes, h, participation = rig.modes, sample_time / substeps, participation_of(rig)
+    drive = drives(inputs, substeps, rig.actuators, sample_time, input_hold)
     driven, starts, ends, at_samples, courses, sizes = drive
     damping = np.diag(modes.damping).copy()
     corrections = {c: motion_correction(c, modes.omega, damping, h) for c in {course for _, course in courses}}

@@ -46,11 +46,7 @@ class PlaceError(ValueError):
 
 
 def position(place: Location) -> float:
-    """A place as a position along an interval, m.
-
-    Raises:
-        PlaceError: a pair, a name, or two places.
-    """
+    """A place as a position along an interval, m; a pair, a name, or two places are a `PlaceError`."""
     if isinstance(place, tuple | str):
         raise PlaceError(f"a place along an interval is a position x in m; got {place!r}")
     return float(place)
@@ -452,11 +448,7 @@ def as_domain(domain: Domain | float) -> Domain:
 
 
 def same_place(place: Any) -> Any:
-    """A place in its hashable form: a float, a pair of floats, a name, `Between` two, or a `Patch`.
-
-    Raises:
-        PlaceError: none of these.
-    """
+    """A place in its hashable form: a float, a pair of floats, a name, `Between` two, or a `Patch`."""
     if isinstance(place, str) or type(place) is float:
         return place
     if isinstance(place, Between):
@@ -492,11 +484,7 @@ def listed(places: np.ndarray) -> list[Place]:
 
 
 def middle(where: Location) -> Place:
-    """The middle of a patch or of the interval between two positions; a single place itself.
-
-    Raises:
-        PlaceError: `Between` two places that are no positions along an interval.
-    """
+    """The middle of a patch or of the interval between two positions along an interval; a single place itself."""
     if isinstance(where, Patch):
         return (where.x, where.y)
     if isinstance(where, Between):

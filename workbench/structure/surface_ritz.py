@@ -73,14 +73,8 @@ class SurfaceModes:
 def solve(problem: SurfaceProblem, n_modes: int, *, tolerance: float, beyond: int = 0) -> SurfaceModes:
     """The lowest modes, refined until the frequencies converge to a relative `tolerance`.
 
-    Args:
-        problem: the eigenvalue problem.
-        n_modes: number of modes.
-        tolerance: relative, of the frequencies.
-        beyond: largest number of further modes, computed with the same functions.
-
-    Raises:
-        ValueError: the tolerance is not reached with `MOST_FUNCTIONS` functions (with the error reached), or buckling.
+    Up to `beyond` further modes are computed with the same functions. Buckling, or a tolerance that is not reached
+    with `MOST_FUNCTIONS` functions, is a `ValueError`.
     """
     before, change, error = np.zeros(0), np.inf, np.inf
     for level in range(20):
