@@ -1,5 +1,6 @@
 """Writing a case folder."""
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -38,7 +39,7 @@ def write_case(case: Case, folder: str | Path) -> Path:
     folder = Path(folder)
     (folder / "records").mkdir(parents=True, exist_ok=True)
     units = [] if case.units == SI else [_table("[units]", **asdict(case.units))]
-    blocks = [f"title = {_text(case.name)}", *units, *_rig(case.rig, folder)]
+    blocks = [f"title = {_value(case.name)}", *units, *_rig(case.rig, folder)]
     for record, use in [*((r, "fit") for r in case.fit), *((r, "validate") for r in case.validation)]:
         name = record.name.replace("%", "%25").replace("/", "%2F").replace("\\", "%5C")  # it names no folder
         file = f"records/{name}.npz"
@@ -215,15 +216,9 @@ def _table(header: str, **entries: object) -> str:
 
 
 def _value(value: Any) -> str:
-    if isinstance(value, str):
-        return _text(value)
+    """A value in TOML, which writes texts, numbers and lists as JSON does."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key} = {_value(item)}" for key, item in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(_value(item) for item in value) + "]"
-    return repr(value) if isinstance(value, int) else repr(float(value))
-
-
-def _text(text: str) -> str:
-    kept = "".join(c if c.isprintable() else " " for c in text)
-    return '"' + kept.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(value, str):
+        value = "".join(c if c.isprintable() else " " for c in value)
+    return json.dumps(value, ensure_ascii=False, default=float)

@@ -28,8 +28,7 @@ DELAY_ORDER = 0.7  # order of a delay line per radian of the fastest mode within
 def input_matrix(modes: Modes, actuators: Sequence[Actuator]) -> np.ndarray:
     """Modal forces per unit command (n_modes, n_actuators): gain times φ_r at the place, or its slope for a moment.
 
-    Raises:
-        ValueError: an actuator on a support, where it does no work, or with cross-talk, which no design includes.
+    An actuator on a support, where it does no work, or with cross-talk, which no design includes, is a `ValueError`.
     """
     leaking = next((actuator for actuator in actuators if actuator.crosstalk), None)
     if leaking is not None:
@@ -110,11 +109,8 @@ def modal_plant(
     """A, B, C, D and the names of the states, from commands to readings and to the delayed and lagged commands.
 
     Lags and delays are included, a delay as of `delay_line`; nonlinear imperfections are not, and cross-talk where it
-    is asked for. The last n_actuators rows of C and D give the delayed and lagged commands, before the gains.
-
-    Raises:
-        ValueError: cross-talk from a sensor or an actuator that is not among these; cross-talk of actuators, where
-            none is asked for.
+    is asked for: without, that of an actuator is a `ValueError`. The last n_actuators rows of C and D give the delayed
+    and lagged commands, before the gains.
     """
     n, m = modes.n_modes, len(actuators)
     force = _input_matrix(modes, actuators) if with_crosstalk else input_matrix(modes, actuators)
@@ -140,27 +136,22 @@ def modal_plant(
         c, d = c + share @ more[0], d + share @ more[1]
     c, d = np.vstack([c, np.zeros((m, 2 * n))]), np.vstack([d, np.eye(m)])
     states = [f"q{r + 1}" for r in range(n)] + [f"dq{r + 1}" for r in range(n)]
-    for j, actuator in enumerate(actuators):
-        for what, (pa, pb, pc) in lateness(actuator, modes):
+    transducers: list[tuple[int, Transducer]] = [*enumerate(actuators), *enumerate(sensors)]
+    for j, part in transducers:
+        for what, (pa, pb, pc) in lateness(part, modes):
             size = len(pa)
-            a = np.block([[a, b[:, [j]] * pc], [np.zeros((size, len(a))), pa]])
-            b, c = np.vstack([b, np.zeros((size, m))]), np.hstack([c, d[:, [j]] * pc])
-            b[:, j], d[:, j] = np.r_[np.zeros(len(a) - size), pb], 0.0
-            states += _named(f"{actuator.name}_{what}", size)
-    for j, sensor in enumerate(sensors):
-        for what, (pa, pb, pc) in lateness(sensor, modes):
-            size = len(pa)
-            a = np.block([[a, np.zeros((len(a), size))], [np.outer(pb, c[j]), pa]])
-            b, c = np.vstack([b, np.outer(pb, d[j])]), np.hstack([c, np.zeros((len(c), size))])
-            c[j], d[j] = np.r_[np.zeros(len(a) - size), pc], 0.0
-            states += _named(f"{sensor.name}_{what}", size)
+            if isinstance(part, Actuator):
+                a = np.block([[a, b[:, [j]] * pc], [np.zeros((size, len(a))), pa]])
+                b, c = np.vstack([b, np.zeros((size, m))]), np.hstack([c, d[:, [j]] * pc])
+                b[:, j], d[:, j] = np.r_[np.zeros(len(a) - size), pb], 0.0
+            else:
+                a = np.block([[a, np.zeros((len(a), size))], [np.outer(pb, c[j]), pa]])
+                b, c = np.vstack([b, np.outer(pb, d[j])]), np.hstack([c, np.zeros((len(c), size))])
+                c[j], d[j] = np.r_[np.zeros(len(a) - size), pc], 0.0
+            states += [f"{part.name}_{what}{i + 1 if size > 1 else ''}" for i in range(size)]
     if any(actuator.crosstalk for actuator in actuators):
         b, d = b @ mixing(actuators), d @ mixing(actuators)
     return a, b, c, d, states
-
-
-def _named(name: str, size: int) -> list[str]:
-    return [name] if size == 1 else [f"{name}{i + 1}" for i in range(size)]
 
 
 Late = tuple[Floats, Floats, Floats]

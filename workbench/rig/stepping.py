@@ -228,13 +228,6 @@ def _advance_once(
 
 
 @njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
-def _fill_rates(shapes: Floats, v: Floats, rates: Floats, row: int) -> None:
-    """Fill a row of `rates` with the velocities at the elements."""
-    for i in range(shapes.shape[0]):
-        rates[row, i] = row_times(shapes, i, v)
-
-
-@njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
 def _friction_reverses(kinds: Integers, parameters: Floats, rates: Floats) -> bool:
     """Whether a friction force reverses between two rates (2, n_elements): they pass its smoothing speed."""
     for i in range(kinds.size):
@@ -296,7 +289,8 @@ def advance(
     if friction:
         _keep(modes_kept, q, v, old, spread)
         _keep(points_kept, point, earlier, w, z)
-        _fill_rates(shapes, v, rates, 0)
+        for i in range(kinds.size):
+            rates[0, i] = row_times(shapes, i, v)
     parts, part = 1, 0
     while part < parts:
         # one call for both cases, because every inlined call is compiled again
@@ -312,7 +306,8 @@ def advance(
         )
         part += 1
         if friction and whole:
-            _fill_rates(shapes, v, rates, 1)
+            for i in range(kinds.size):
+                rates[1, i] = row_times(shapes, i, v)
             if _friction_reverses(kinds, parameters, rates):
                 _put_back(modes_kept, q, v, old, spread)
                 _put_back(points_kept, point, earlier, w, z)
