@@ -31,6 +31,7 @@ from workbench.structure.domain import NamedPoints, Place, PlaceError
 from workbench.structure.member import Bar, Beam, Structure
 from workbench.structure.modes import Modes, PointShapes
 from workbench.structure.plate import Plate
+from workbench.structure.supports import SIDES
 
 MOST_MODES = 200
 PLATE_TOLERANCE = 1e-5  # of frequencies; where a clamped edge meets a free one, 1e-6 may need too many functions
@@ -42,7 +43,6 @@ STRUCTURES = {"beam": (*MEMBER, "bending_stiffness", "tension"), "rod": (*MEMBER
 KINDS = (*STRUCTURES, "plate", "modal")
 MODAL = ("kind", "natural_frequencies_hz", "damping_ratios", "rigid_damping", "points")
 PLATE = ("kind", "length", "mass_per_area", "bending_stiffness", "poisson_ratio", "edges", "damping_ratio", "modes")
-EDGES = ("left", "right", "bottom", "top")
 ENDS = {"beam": ("hinged", "clamped", "free", "sliding"), "rod": ("fixed", "free")}
 EDGE = ("simply supported", "clamped", "guided", "free")
 # What others call ends and edges. A rod has no bending: whatever holds its end fixes it.
@@ -144,15 +144,15 @@ def _plate_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: lis
     _check_transducers(inputs, outputs, "at", "plate")
     edges = table.get("edges")
     if not isinstance(edges, dict):
-        raise CaseError(f"[structure]: edges must be a table of {', '.join(EDGES)}; got {shown(edges)}")
-    check_keys(edges, EDGES, "[structure] edges")
+        raise CaseError(f"[structure]: edges must be a table of {', '.join(SIDES)}; got {shown(edges)}")
+    check_keys(edges, SIDES, "[structure] edges")
     a, b = numbers(table, "length", "[structure]", 2)
     structure = Plate(
         length=(float(a), float(b)),
         mass_per_area=number(table, "mass_per_area", "[structure]", low=0.0),
         bending_stiffness=number(table, "bending_stiffness", "[structure]", low=0.0),
         poisson_ratio=number(table, "poisson_ratio", "[structure]"),
-        edges={side: one_of(edges, side, EDGE, "[structure] edges", synonyms=SYNONYMS["plate"]) for side in EDGES},
+        edges={side: one_of(edges, side, EDGE, "[structure] edges", synonyms=SYNONYMS["plate"]) for side in SIDES},
         damping=ModalDamping(number(table, "damping_ratio", "[structure]", low=0.0)),
     )
     modes = structure.modes(count(table, "modes", MOST_MODES), tolerance=PLATE_TOLERANCE)
@@ -271,12 +271,8 @@ def _patch(entry: dict[str, Any], at: Place, where: str) -> Actuator:
         raise CaseError(f"{where}: the kind of a patch is actuator, not hammer")
     if entry.get("quantity", "moment") != "moment":
         raise CaseError(f"{where}: a patch acts by moments along its edges; leave quantity out")
-    length: float | tuple[float, float]
-    if isinstance(at, tuple):
-        width, height = numbers(entry, "patch", where, 2).tolist()
-        length = (width, height)
-    else:
-        length = number(entry, "patch", where)
+    on_plate = isinstance(at, tuple)
+    length: Any = tuple(numbers(entry, "patch", where, 2)) if on_plate else number(entry, "patch", where)
     axis = entry.get("axis")
     if axis not in (None, "x", "y"):
         raise CaseError(f"{where}: axis is x or y, or left out for moments about both; got {shown(axis)}")

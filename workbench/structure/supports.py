@@ -62,11 +62,7 @@ def as_end(end: str | End, *, allowed: tuple[str, ...]) -> End:
 
 
 def as_edges(edges: str | Edge | Mapping[str, str | Edge], *, allowed: tuple[str, ...]) -> dict[str, Edge]:
-    """Left (x = 0), right, bottom (y = 0) and top edge, from one for all four or from a mapping of the four.
-
-    Raises:
-        ValueError: a side that is missing or unknown, or an edge of unknown name.
-    """
+    """Left (x = 0), right, bottom (y = 0) and top edge, from one for all four or from a mapping of the four."""
     each = dict(edges) if isinstance(edges, Mapping) else dict.fromkeys(SIDES, edges)
     if set(each) != set(SIDES):
         got = ", ".join(map(str, each)) or "none"

@@ -156,8 +156,7 @@ def _ritz(
         raise ValueError(UNSTABLE)
     values = np.where(values < RIGID * problem.scale, 0.0, values)
     order = np.argsort(values, kind="stable")
-    modes = _rotated(SurfaceModes(np.sqrt(values), tuple(parts)), np.eye(n_modes)[:, order])
-    modes = replace(modes, omega=np.sqrt(values[order]))
+    modes = _rotated(SurfaceModes(np.sqrt(values[order]), tuple(parts)), np.eye(n_modes)[:, order])
     modes = _rotated(modes, _uncoupling(modes, problem))
     return _rotated(modes, np.diag(_signs(modes, problem)))
 
