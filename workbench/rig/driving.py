@@ -206,16 +206,10 @@ def drives(
 def _delayed_and_lagged(
     mean: Floats, rise: Floats, start: Floats, actuator: Actuator, h: float
 ) -> tuple[Floats, Floats, Floats, list[tuple[Course, Floats]]]:
-    """Forces that are linear over substeps, after delay and lag.
+    """Forces that are linear over substeps of h, after the delay and the lag of an actuator.
 
-    Args:
-        mean, rise: of each substep, half the rise.
-        start: force at the start of each, which differs from mean - rise where a ramp ends within the substep.
-        actuator: has the delay and the lag.
-        h: substep, s.
-
-    Returns:
-        Mean and half the rise of the linear part; the force at each start; and unit courses of the rest, with sizes.
+    Each has its mean, half its rise, and its start, which differs from mean - rise where a ramp ends within the
+    substep. Returned are those of the linear part, and unit courses of the rest, with sizes.
     """
     shift, late = whole_samples(actuator.delay, h)
     old_mean, old_rise = (shifted(each, shift + 1) for each in (mean, rise))

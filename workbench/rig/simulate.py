@@ -237,12 +237,9 @@ def prediction_errors(
 
     Args:
         rig: its sensors may have gain, bias and drift; lag, clipping and rounding are not included.
-        inputs: (n_actuators, n_samples) commands.
-        outputs: (n_sensors, n_samples) measured.
+        inputs, outputs: commands (n_actuators, n_samples) and measured readings (n_sensors, n_samples).
         gain: (2, n_modes, n_sensors) of the observer, from innovations to displacements and velocities of the modes.
-        sample_time: s.
-        substeps: per sample interval.
-        input_hold: as of `simulate`.
+        sample_time, substeps, input_hold: as of `simulate`.
     """
     participation, at_samples, forces = _forces(rig, inputs, sample_time, substeps, input_hold)
     reading, orders = reading_of(rig)

@@ -130,8 +130,8 @@ def modal_plant(
     c, d = read(sensors)
     if with_crosstalk and any(sensor.crosstalk for sensor in sensors):
         share = np.zeros((len(sensors), len(sensors)))
-        for j, i, part in crosstalk_between(sensors):
-            share[j, i] += sensors[j].gain * part
+        for j, i, taken in crosstalk_between(sensors):
+            share[j, i] += sensors[j].gain * taken
         more = read([replace(sensor, gain=1.0) for sensor in sensors])
         c, d = c + share @ more[0], d + share @ more[1]
     c, d = np.vstack([c, np.zeros((m, 2 * n))]), np.vstack([d, np.eye(m)])

@@ -37,7 +37,7 @@ Along = tuple[float, Floats, Floats, Floats, Floats, Floats]
 Moving = tuple[Floats, Floats, Floats]
 Points = tuple[Floats, Floats, Floats, Floats]
 Work = tuple[Floats, Floats, Floats, Floats, Floats, Floats]
-Kept = tuple[Floats, Floats, Floats, Floats]
+Kept = tuple[Points, Points, Floats, Drives]
 
 
 @lru_cache(maxsize=KEPT)
@@ -239,17 +239,12 @@ def _friction_reverses(kinds: Integers, parameters: Floats, rates: Floats) -> bo
 
 
 @njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
-def _keep(kept: Floats, a: Floats, b: Floats, c: Floats, d: Floats) -> None:
-    """Copy four arrays (n,) into `kept` (4, n)."""
+def _copy(arrays: Points, into: Points) -> None:
+    """Copy four arrays of one length into four others."""
+    a, b, c, d = arrays
+    e, f, g, h = into
     for i in range(a.size):
-        kept[0, i], kept[1, i], kept[2, i], kept[3, i] = a[i], b[i], c[i], d[i]
-
-
-@njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
-def _put_back(kept: Floats, a: Floats, b: Floats, c: Floats, d: Floats) -> None:
-    """Restore four arrays (n,) from `kept` (4, n)."""
-    for i in range(a.size):
-        a[i], b[i], c[i], d[i] = kept[0, i], kept[1, i], kept[2, i], kept[3, i]
+        e[i], f[i], g[i], h[i] = a[i], b[i], c[i], d[i]
 
 
 @njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
@@ -281,44 +276,35 @@ def advance(
     """
     kinds, shapes, parameters = elements
     start, end, more_q, more_v = drives
-    q, v, old = motion
-    point, earlier, w, z = points
-    spread = work[5]
-    modes_kept, points_kept, rates, parts_of = kept
+    v, moving = motion[1], (motion[0], motion[1], motion[2], work[5])
+    moving_kept, points_kept, rates, of_part = kept
     friction = _has_friction(kinds)
     if friction:
-        _keep(modes_kept, q, v, old, spread)
-        _keep(points_kept, point, earlier, w, z)
+        _copy(moving, moving_kept)
+        _copy(points, points_kept)
         for i in range(kinds.size):
             rates[0, i] = row_times(shapes, i, v)
     parts, part = 1, 0
     while part < parts:
         # one call for both cases, because every inlined call is compiled again
         whole = parts == 1
-        _advance_once(
-            linear if whole else finely,
-            drives if whole else (parts_of[0], parts_of[1], parts_of[2], parts_of[3]),
-            elements,
-            along,
-            motion,
-            points,
-            work,
-        )
+        coefficients, forces = (linear, drives) if whole else (finely, of_part)
+        _advance_once(coefficients, forces, elements, along, motion, points, work)
         part += 1
         if friction and whole:
             for i in range(kinds.size):
                 rates[1, i] = row_times(shapes, i, v)
             if _friction_reverses(kinds, parameters, rates):
-                _put_back(modes_kept, q, v, old, spread)
-                _put_back(points_kept, point, earlier, w, z)
+                _copy(moving_kept, moving)
+                _copy(points_kept, points)
                 parts, part = PARTS, 0
         if parts > 1:
-            for r in range(q.size):
+            for r in range(v.size):
                 rise = (end[r] - start[r]) / PARTS
-                parts_of[0, r] = start[r] + part * rise
-                parts_of[1, r] = parts_of[0, r] + rise
-                parts_of[2, r] = more_q[r] if part == PARTS - 1 else 0.0
-                parts_of[3, r] = more_v[r] if part == PARTS - 1 else 0.0
+                of_part[0][r] = start[r] + part * rise
+                of_part[1][r] = of_part[0][r] + rise
+                of_part[2][r] = more_q[r] if part == PARTS - 1 else 0.0
+                of_part[3][r] = more_v[r] if part == PARTS - 1 else 0.0
 
 
 @njit(cache=True, nogil=True)
@@ -329,8 +315,11 @@ def at_rest(n: int, n_elements: int) -> tuple[Linear, Linear, Drives, Moving, Po
     motion = np.zeros(n), np.zeros(n), np.zeros(n)
     points = np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements)
     work = np.zeros(n_elements), np.zeros(n_elements), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
-    kept = np.zeros((4, n)), np.zeros((4, n_elements)), np.zeros((2, n_elements)), np.zeros((4, n))
     drives = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    moving = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    of_points = np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements)
+    of_part = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    kept = moving, of_points, np.zeros((2, n_elements)), of_part
     return linear, finely, drives, motion, points, work, kept
 
 
