@@ -16,8 +16,8 @@ from workbench.cases.tables import (
     numbers,
     one_of,
     profile,
-    said,
     shown,
+    suggesting,
     table_of,
     tables,
     text,
@@ -117,7 +117,7 @@ def _member_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: li
     """The rig of a rod or a beam, whose lengths are in a unit."""
     kind = "rod" if table.get("kind") == "bar" else table.get("kind")  # synonyms
     if not isinstance(kind, str) or kind not in STRUCTURES:
-        raise CaseError(f"[structure]: kind is beam, rod, plate or modal; got {said(kind, KINDS)}")
+        raise CaseError(f"[structure]: kind is beam, rod, plate or modal; got {suggesting(kind, KINDS)}")
     check_keys(table, STRUCTURES[kind], "[structure]")
     _check_transducers(inputs, outputs, "at", kind)
     common: dict[str, Any] = {
@@ -286,7 +286,7 @@ def _sensor(entry: dict[str, Any], at: Place, modes: Modes) -> Sensor:
     where = f"[[output]] {entry['name']!r}"
     quantity = entry.get("quantity")
     if quantity not in MEASURED:
-        raise CaseError(f"{where}: quantity is one of {', '.join(MEASURED)}; got {said(quantity, MEASURED)}")
+        raise CaseError(f"{where}: quantity is one of {', '.join(MEASURED)}; got {suggesting(quantity, MEASURED)}")
     noise = number(entry, "noise_std", where, low=0.0) if "noise_std" in entry else 0.0
     if noise == 0 and "noise_std" in entry:
         raise CaseError(f"{where}: noise_std must be positive; leave it out where it is not known")

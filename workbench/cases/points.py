@@ -44,7 +44,9 @@ def read_points(path: Path, n_modes: int) -> tuple[NamedPoints, np.ndarray]:
     values = np.array([[_number(path, i, row, c) for c in numeric] for i, row in rows])
     names, directions, nodes = (
         tuple(
-            text(row, column, f"{path}, line {i + 2}") if row[column] != "" or column != "direction" else ""
+            ""
+            if column == "direction" and row[column] == ""
+            else text(row, column, f"{path}, line {i + 2}, column {column!r}")
             for i, row in rows
         )
         for column in ("name", "direction", "node")

@@ -99,11 +99,11 @@ def one_of(
     """The text under `key`, one of those allowed; synonyms, {what others say: allowed text}, help in the message."""
     value = text(entry, key, where)
     if value not in allowed:
-        raise CaseError(f"{where}: {key} is one of {', '.join(allowed)}; got {said(value, allowed, synonyms)}")
+        raise CaseError(f"{where}: {key} is one of {', '.join(allowed)}; got {suggesting(value, allowed, synonyms)}")
     return value
 
 
-def said(value: object, allowed: Iterable[str], synonyms: Mapping[str, str] = NO_SYNONYMS) -> str:
+def suggesting(value: object, allowed: Iterable[str], synonyms: Mapping[str, str] = NO_SYNONYMS) -> str:
     """A value that is not allowed, for a message, and the allowed text that is probably meant."""
     word = str(value).lower().replace("-", " ").replace("_", " ")[:MOST_LETTERS]
     if word in synonyms:

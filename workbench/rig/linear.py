@@ -169,7 +169,7 @@ def held_response(
     return response, acting
 
 
-def straight_response(
+def first_order_hold_response(
     system: ModalPoles,
     forces: np.ndarray,
     participation: np.ndarray,

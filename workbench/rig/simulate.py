@@ -14,12 +14,12 @@ from workbench.rig.elements import PeriodicForce, RandomForce
 from workbench.rig.lanes import on_lanes
 from workbench.rig.linear import (
     ModalPoles,
+    first_order_hold_response,
     held_response,
     modal_motion,
     modal_poles,
     shifted,
     sinusoid_response,
-    straight_response,
     whole_samples,
 )
 from workbench.rig.motion import Motion, Step
@@ -127,7 +127,7 @@ def _move_exactly(
     system, inputs = _poles(modes), mixed(rig.actuators, inputs)
     responses: list[Complexes] = []
     acting = np.zeros((inputs.shape[0], inputs.shape[1] // every))
-    response_to = held_response if input_hold == "zero" else partial(straight_response, every=every)
+    response_to = held_response if input_hold == "zero" else partial(first_order_hold_response, every=every)
     for delay, lag in {(a.delay, a.time_constant) for a in rig.actuators}:
         group = [j for j, a in enumerate(rig.actuators) if (a.delay, a.time_constant) == (delay, lag)]
         forces = np.array([actuator_force(rig.actuators[j], inputs[j]) for j in group])
@@ -262,10 +262,10 @@ def _forces(
     """Participation (n_modes, n_forces) of actuators and sinusoids, their forces at samples and for `step_record`."""
     modes, h, participation = rig.modes, sample_time / substeps, participation_of(rig)
     drive = drives(inputs, substeps, rig.actuators, sample_time, input_hold)
-    driven, starts, ends, at_samples, courses, sizes = drive
+    driven, starts, ends, at_samples, waveforms, sizes = drive
     damping = np.diag(modes.damping).copy()
-    corrections = {c: motion_correction(c, modes.omega, damping, h) for c in {course for _, course in courses}}
-    added = [corrections[course] * participation[:, j] for j, course in courses]
+    corrections = {c: motion_correction(c, modes.omega, damping, h) for c in {waveform for _, waveform in waveforms}}
+    added = [corrections[waveform] * participation[:, j] for j, waveform in waveforms]
     for element in rig.elements:
         if isinstance(element, PeriodicForce):
             start, end, now = sinusoid_on_substeps(element, inputs.shape[1], sample_time, substeps)

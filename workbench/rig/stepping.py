@@ -99,7 +99,7 @@ def law_arrays(rig: Rig) -> Elements:
 
 
 @njit(cache=True, nogil=True)
-def spread_forces(q: Floats, v: Floats, along: Along, out: Floats) -> None:
+def distributed_forces(q: Floats, v: Floats, along: Along, out: Floats) -> None:
     """Fill the modal forces (n_modes,) of stretching, drag and damping that couples modes.
 
     `along` holds their arrays, see `structure_arrays`, with a work array (n_points,) before the coupling.
@@ -215,7 +215,7 @@ def _advance_once(
             v[r] = base_v[r] + e[1, 3, r] * new[r]
         if distributed and sweep == 0:
             # distributed forces, from the predicted motion
-            spread_forces(q, v, along, spread)
+            distributed_forces(q, v, along, spread)
     for r in range(n):
         old[r] = new[r]
     for i in range(n_elements):
@@ -267,7 +267,7 @@ def advance(
         drives: modal forces (n_modes,) at the start and the end of the substep; and corrections of q and q' at the end
             for forces that are not linear.
         elements: kinds (n_elements,), shapes (n_elements, n_modes) and parameters (n_elements, 3) of point elements.
-        along: distributed elements, see `spread_forces`.
+        along: distributed elements, see `distributed_forces`.
         motion: q, q' and the modal forces of all elements, (n_modes,): updated.
         points: forces, previous forces, displacements and hysteretic displacements, (n_elements,): updated.
         work: free displacements and rates (n_elements,); q, q' and forces (n_modes,); distributed forces (n_modes,),
