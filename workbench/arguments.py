@@ -22,7 +22,7 @@ def whole(value: Any, what: str, *, least: int = 0) -> int:
 
 
 def number(value: Any, what: str, unit: str = "") -> float:
-    """The value, `what` it is in `unit`, as a float, which may be infinite or nan; no number is a `TypeError`."""
+    """The value, `what` it is in `unit`, as a float, which may be infinite or nan; a `TypeError` if it is no number."""
     if not _is_number(value):
         raise TypeError(f"{what} is a number{f' in {unit}' if unit else ''}; got {value!r}")
     return float(value)

@@ -115,7 +115,7 @@ def law_from(
     impulse_at: Location | None = None,
     impulse: float = 1.0,
 ) -> "Law | OnOffLaw":
-    """The law of this name, with a weight or a damping ratio; both, or one that the law has not, is a `ValueError`."""
+    """The law of this name, with a weight or a damping ratio; both, or one that the law has not, is refused."""
     from workbench.design.laws.coupled import coupled_lqr
     from workbench.design.laws.imsc import imsc
     from workbench.robust.plain_law import plain_law

@@ -82,7 +82,7 @@ class Sensor(Constructed):
 
 
 def crosstalk_between(sensors: Sequence[Sensor]) -> list[tuple[int, int, float]]:
-    """Cross-talk of sensors: (index, index of the other sensor, share); a share of no other is a `ValueError`."""
+    """Cross-talk of sensors, (index, index of the other, share); an unknown name is refused by a `ValueError`."""
     names = [sensor.name for sensor in sensors]
     for sensor in sensors:
         for name, _ in sensor.crosstalk:

@@ -28,7 +28,7 @@ DELAY_ORDER = 0.7  # order of a delay line per radian of the fastest mode within
 def input_matrix(modes: Modes, actuators: Sequence[Actuator]) -> np.ndarray:
     """Modal forces per unit command (n_modes, n_actuators): gain times φ_r at the place, or its slope for a moment.
 
-    An actuator on a support, where it does no work, or with cross-talk, which no design includes, is a `ValueError`.
+    An actuator on a support, where it does no work, or with cross-talk, which no design includes, is refused.
     """
     leaking = next((actuator for actuator in actuators if actuator.crosstalk), None)
     if leaking is not None:
@@ -71,36 +71,22 @@ def state_space(modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[S
             cross-talk from a sensor or an actuator that is not among these.
     """
     parts: tuple[Transducer, ...] = (*actuators, *sensors)
-    for part in parts:
-        _check_finite_linear(part)
-    a, b, c, d, states = modal_plant(modes, actuators, sensors, with_crosstalk=True)
-    return control.ss(
-        a,
-        b,
-        c[: len(sensors)],
-        d[: len(sensors)],
-        inputs=signal_names(x.name for x in actuators),
-        outputs=signal_names(y.name for y in sensors),
-        states=signal_names(states),
-        name="rig",
-    )
-
-
-def _check_finite_linear(part: Transducer) -> None:
-    """Refuse an actuator or a sensor that no finite `StateSpace` represents, by a `ValueError`."""
-    if part.has_state_space:
-        return
-    channel = transducer_text(part)
-    if replace(part, delay=0.0).has_state_space:
+    for part in (part for part in parts if not part.has_state_space):
+        channel = transducer_text(part)
+        if replace(part, delay=0.0).has_state_space:
+            raise ValueError(
+                f"{channel} has a delay, which no finite StateSpace represents exactly; leave it out and connect an"
+                " approximation by control.pade in series, or simulate the rig"
+            )
+        nonlinear = [what for name, what in NONLINEAR.items() if getattr(part, name, 0.0) not in (0.0, np.inf)]
         raise ValueError(
-            f"{channel} has a delay, which no finite StateSpace represents exactly; leave it out and connect an"
-            " approximation by control.pade in series, or simulate the rig"
+            f"{channel} has {joined_in_words(nonlinear)}, so it is not linear and the rig has no StateSpace; simulate"
+            " it instead"
         )
-    nonlinear = [what for name, what in NONLINEAR.items() if getattr(part, name, 0.0) not in (0.0, np.inf)]
-    raise ValueError(
-        f"{channel} has {joined_in_words(nonlinear)}, so it is not linear and the rig has no StateSpace; simulate it"
-        " instead"
-    )
+    a, b, c, d, states = modal_plant(modes, actuators, sensors, with_crosstalk=True)
+    n = len(sensors)
+    names = {"inputs": signal_names(x.name for x in actuators), "outputs": signal_names(y.name for y in sensors)}
+    return control.ss(a, b, c[:n], d[:n], states=signal_names(states), name="rig", **names)
 
 
 def modal_plant(
@@ -109,8 +95,8 @@ def modal_plant(
     """A, B, C, D and the names of the states, from commands to readings and to the delayed and lagged commands.
 
     Lags and delays are included, a delay as of `delay_line`; nonlinear imperfections are not, and cross-talk where it
-    is asked for: without, that of an actuator is a `ValueError`. The last n_actuators rows of C and D give the delayed
-    and lagged commands, before the gains.
+    is asked for: without, that of an actuator raises a `ValueError`. The last n_actuators rows of C and D give the
+    delayed and lagged commands, before the gains.
     """
     n, m = modes.n_modes, len(actuators)
     force = _input_matrix(modes, actuators) if with_crosstalk else input_matrix(modes, actuators)

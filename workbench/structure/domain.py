@@ -46,7 +46,7 @@ class PlaceError(ValueError):
 
 
 def position(place: Location) -> float:
-    """A place as a position along an interval, m; a pair, a name, or two places are a `PlaceError`."""
+    """A place as a position along an interval, m; a pair, a name, or two places raise a `PlaceError`."""
     if isinstance(place, tuple | str):
         raise PlaceError(f"a place along an interval is a position x in m; got {place!r}")
     return float(place)

@@ -73,8 +73,8 @@ class SurfaceModes:
 def solve(problem: SurfaceProblem, n_modes: int, *, tolerance: float, beyond: int = 0) -> SurfaceModes:
     """The lowest modes, refined until the frequencies converge to a relative `tolerance`.
 
-    Up to `beyond` further modes are computed with the same functions. Buckling, or a tolerance that is not reached
-    with `MOST_FUNCTIONS` functions, is a `ValueError`.
+    Up to `beyond` further modes are computed with the same functions. Buckling, and a tolerance that is not reached
+    with `MOST_FUNCTIONS` functions, raise a `ValueError`.
     """
     before, change, error = np.zeros(0), np.inf, np.inf
     for level in range(20):
