@@ -161,7 +161,7 @@ def show_table(headings: Sequence[str], rows: Iterable[Sequence[str]], *, right:
 def check_target(*paths: Path | None, page: Path | None = None, figure: Path | None = None) -> None:
     """Refuse paths that cannot be written, or a suffix of another format, before the computation.
 
-    The folder of a page, or of a figure, is made if there is none; of a figure the suffix alone is checked.
+    The folder of a page is made if there is none; of a figure the suffix alone is checked.
     """
     if page is not None and not page.is_dir() and page.suffix.lower() not in PAGES:
         raise ValueError(f"--page writes HTML; name a file such as {page.stem}.html; got {page.name}")
