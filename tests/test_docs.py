@@ -13,13 +13,14 @@ from typer.main import get_command
 
 import workbench
 from workbench.cases.case import RECORD
-from workbench.cases.nominal import EDGES, INPUT, MEMBER, MODAL, OUTPUT, PLATE, SINGLE, STRUCTURES, TABLES
+from workbench.cases.nominal import INPUT, MEMBER, MODAL, OUTPUT, PLATE, SINGLE, STRUCTURES, TABLES
 from workbench.cli.app import app
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.structure.member import Beam
+from workbench.structure.supports import SIDES
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -81,7 +82,7 @@ def test_the_case_format_names_every_key_and_every_effect():
         *TABLES,
         *MEMBER,
         *PLATE,
-        *EDGES,
+        *SIDES,
         *MODAL,
         *SINGLE,
         *INPUT,

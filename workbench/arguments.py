@@ -7,16 +7,11 @@ import numpy as np
 
 
 def whole(value: Any, what: str, *, least: int = 0) -> int:
-    """The value as an int.
-
-    Args:
-        value: as given.
-        what: it is, the subject of the message.
-        least: that it may be.
+    """The value as an int, `least` or more; `what` it is, is the subject of the message.
 
     Raises:
         TypeError: no number.
-        ValueError: a part of one, or too small.
+        ValueError: not whole, or too small.
     """
     asked = f"{what} is a whole number, {least} or more"
     if not _is_number(value):
@@ -27,16 +22,7 @@ def whole(value: Any, what: str, *, least: int = 0) -> int:
 
 
 def number(value: Any, what: str, unit: str = "") -> float:
-    """The value as a float, which may be infinite or no number yet.
-
-    Args:
-        value: as given.
-        what: it is, the subject of the message.
-        unit: in which it is measured.
-
-    Raises:
-        TypeError: no number.
-    """
+    """The value, `what` it is in `unit`, as a float, which may be infinite or nan; a `TypeError` if it is no number."""
     if not _is_number(value):
         raise TypeError(f"{what} is a number{f' in {unit}' if unit else ''}; got {value!r}")
     return float(value)

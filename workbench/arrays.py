@@ -18,9 +18,7 @@ def symmetric_root(matrix: np.ndarray) -> Floats:
 def scaled_inverse(matrix: np.ndarray, rcond: float = 1e-15) -> Floats:
     """Pseudo-inverse of normal equations, a symmetric matrix, each unknown in units of its own diagonal entry's root.
 
-    Args:
-        rcond: eigenvalues of the scaled matrix below this share of the largest, those that rounding makes negative
-            among them, count as zero.
+    Eigenvalues of the scaled matrix below `rcond` times the largest, negative ones among them, count as zero.
     """
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))

@@ -26,11 +26,7 @@ class Renamed:
 
 
 def former_arguments(**new_names: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """A function, or a constructor, that takes former names of its arguments too, with a DeprecationWarning.
-
-    Args:
-        new_names: by former name.
-    """
+    """A function, or a constructor, that takes former names of its arguments too, with a DeprecationWarning."""
 
     def taking(function: Callable[P, R]) -> Callable[P, R]:
         name = function.__qualname__.removesuffix(".__init__")

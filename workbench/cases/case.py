@@ -124,11 +124,7 @@ def in_units(channels: Sequence[Channel], units: Units) -> tuple[Channel, ...]:
 
 
 def read_units(path: str | Path) -> Units:
-    """The units that a TOML file of the case format names, in which results are reported; SI if it names none.
-
-    Raises:
-        CaseError: naming the file, the key, the value, and what would be right.
-    """
+    """The units that a TOML file of the case format names, in which results are reported; SI if it names none."""
     return _units(table_of(Path(path)), Path(path))
 
 
@@ -182,10 +178,7 @@ def _read_record(
             raise CaseError(
                 f"{file}: output {sensor.name!r} is flat at {level:g}: check the sensor and its cable, or leave it out"
             )
-    inputs, outputs = (
-        np.array([arrays[transducer.name] for transducer in transducers])
-        for transducers in (rig.actuators, rig.sensors)
-    )
+    inputs, outputs = (np.array([arrays[part.name] for part in parts]) for parts in (rig.actuators, rig.sensors))
     record = rig.record(inputs, outputs, sample_time=sample_time, name=name, input_hold=_hold(entry, where))
     record = replace(
         record,
@@ -197,16 +190,7 @@ def _read_record(
 
 
 def check_units(file: Path, channels: Sequence[Channel], stated: Mapping[str, str]) -> None:
-    """Refuse a file whose header states a unit of another quantity than case.toml.
-
-    Args:
-        file: of the record.
-        channels: of the case, in its units.
-        stated: units by the name of the channel; empty where the header states none.
-
-    Raises:
-        CaseError: for the first such channel.
-    """
+    """Refuse a file whose header states a unit, by channel, other than that of the case, by a `CaseError`."""
     for known in channels:
         unit = stated.get(known.name, "")
         if unit not in ("", known.unit):

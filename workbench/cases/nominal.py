@@ -16,8 +16,8 @@ from workbench.cases.tables import (
     numbers,
     one_of,
     profile,
-    said,
     shown,
+    suggesting,
     table_of,
     tables,
     text,
@@ -31,6 +31,7 @@ from workbench.structure.domain import NamedPoints, Place, PlaceError
 from workbench.structure.member import Bar, Beam, Structure
 from workbench.structure.modes import Modes, PointShapes
 from workbench.structure.plate import Plate
+from workbench.structure.supports import SIDES
 
 MOST_MODES = 200
 PLATE_TOLERANCE = 1e-5  # of frequencies; where a clamped edge meets a free one, 1e-6 may need too many functions
@@ -42,7 +43,6 @@ STRUCTURES = {"beam": (*MEMBER, "bending_stiffness", "tension"), "rod": (*MEMBER
 KINDS = (*STRUCTURES, "plate", "modal")
 MODAL = ("kind", "natural_frequencies_hz", "damping_ratios", "rigid_damping", "points")
 PLATE = ("kind", "length", "mass_per_area", "bending_stiffness", "poisson_ratio", "edges", "damping_ratio", "modes")
-EDGES = ("left", "right", "bottom", "top")
 ENDS = {"beam": ("hinged", "clamped", "free", "sliding"), "rod": ("fixed", "free")}
 EDGE = ("simply supported", "clamped", "guided", "free")
 # What others call ends and edges. A rod has no bending: whatever holds its end fixes it.
@@ -83,11 +83,7 @@ def read_rig(path: str | Path) -> Rig:
 
 
 def rig_of(table: dict[str, Any], path: Path) -> Rig:
-    """The rig that the tables of a file describe.
-
-    Raises:
-        CaseError: naming the file, the key, the value, and what would be right.
-    """
+    """The rig that the tables of a file describe; see `read_rig`."""
     check_keys(table, TABLES, str(path))
     inputs, outputs = tables(table, "input", path), tables(table, "output", path)
     names = [entry["name"] for entry in (*inputs, *outputs)]
@@ -111,9 +107,8 @@ def rig_of(table: dict[str, Any], path: Path) -> Rig:
         if structure.get("kind") == "modal":
             return _modal_rig(structure, inputs, outputs, path)
         units = table.get("units")
-        return _member_rig(
-            structure, inputs, outputs, str(units.get("length", "m") if isinstance(units, dict) else "m")
-        )
+        unit = units.get("length", "m") if isinstance(units, dict) else "m"
+        return _member_rig(structure, inputs, outputs, str(unit))
     except (ValueError, TypeError, ArithmeticError) as error:
         raise CaseError(f"{path}: {error}") from error
 
@@ -122,7 +117,7 @@ def _member_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: li
     """The rig of a rod or a beam, whose lengths are in a unit."""
     kind = "rod" if table.get("kind") == "bar" else table.get("kind")  # synonyms
     if not isinstance(kind, str) or kind not in STRUCTURES:
-        raise CaseError(f"[structure]: kind is beam, rod, plate or modal; got {said(kind, KINDS)}")
+        raise CaseError(f"[structure]: kind is beam, rod, plate or modal; got {suggesting(kind, KINDS)}")
     check_keys(table, STRUCTURES[kind], "[structure]")
     _check_transducers(inputs, outputs, "at", kind)
     common: dict[str, Any] = {
@@ -149,15 +144,15 @@ def _plate_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: lis
     _check_transducers(inputs, outputs, "at", "plate")
     edges = table.get("edges")
     if not isinstance(edges, dict):
-        raise CaseError(f"[structure]: edges must be a table of {', '.join(EDGES)}; got {shown(edges)}")
-    check_keys(edges, EDGES, "[structure] edges")
+        raise CaseError(f"[structure]: edges must be a table of {', '.join(SIDES)}; got {shown(edges)}")
+    check_keys(edges, SIDES, "[structure] edges")
     a, b = numbers(table, "length", "[structure]", 2)
     structure = Plate(
         length=(float(a), float(b)),
         mass_per_area=number(table, "mass_per_area", "[structure]", low=0.0),
         bending_stiffness=number(table, "bending_stiffness", "[structure]", low=0.0),
         poisson_ratio=number(table, "poisson_ratio", "[structure]"),
-        edges={side: one_of(edges, side, EDGE, "[structure] edges", synonyms=SYNONYMS["plate"]) for side in EDGES},
+        edges={side: one_of(edges, side, EDGE, "[structure] edges", synonyms=SYNONYMS["plate"]) for side in SIDES},
         damping=ModalDamping(number(table, "damping_ratio", "[structure]", low=0.0)),
     )
     modes = structure.modes(count(table, "modes", MOST_MODES), tolerance=PLATE_TOLERANCE)
@@ -276,12 +271,8 @@ def _patch(entry: dict[str, Any], at: Place, where: str) -> Actuator:
         raise CaseError(f"{where}: the kind of a patch is actuator, not hammer")
     if entry.get("quantity", "moment") != "moment":
         raise CaseError(f"{where}: a patch acts by moments along its edges; leave quantity out")
-    length: float | tuple[float, float]
-    if isinstance(at, tuple):
-        width, height = numbers(entry, "patch", where, 2).tolist()
-        length = (width, height)
-    else:
-        length = number(entry, "patch", where)
+    on_plate = isinstance(at, tuple)
+    length: Any = tuple(numbers(entry, "patch", where, 2)) if on_plate else number(entry, "patch", where)
     axis = entry.get("axis")
     if axis not in (None, "x", "y"):
         raise CaseError(f"{where}: axis is x or y, or left out for moments about both; got {shown(axis)}")
@@ -295,7 +286,7 @@ def _sensor(entry: dict[str, Any], at: Place, modes: Modes) -> Sensor:
     where = f"[[output]] {entry['name']!r}"
     quantity = entry.get("quantity")
     if quantity not in MEASURED:
-        raise CaseError(f"{where}: quantity is one of {', '.join(MEASURED)}; got {said(quantity, MEASURED)}")
+        raise CaseError(f"{where}: quantity is one of {', '.join(MEASURED)}; got {suggesting(quantity, MEASURED)}")
     noise = number(entry, "noise_std", where, low=0.0) if "noise_std" in entry else 0.0
     if noise == 0 and "noise_std" in entry:
         raise CaseError(f"{where}: noise_std must be positive; leave it out where it is not known")

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from workbench.cases.tables import CaseError, shown
+from workbench.cases.tables import CaseError, shown, text
 from workbench.structure.domain import NamedPoints
 
 MOST_POINTS = 100_000
@@ -43,7 +43,12 @@ def read_points(path: Path, n_modes: int) -> tuple[NamedPoints, np.ndarray]:
     numeric = [*("xyz" if known else ""), *columns[len(COLUMNS) :]]
     values = np.array([[_number(path, i, row, c) for c in numeric] for i, row in rows])
     names, directions, nodes = (
-        tuple(_text(path, i, row, column, may_be_empty=column == "direction") for i, row in rows)
+        tuple(
+            ""
+            if column == "direction" and row[column] == ""
+            else text(row, column, f"{path}, line {i + 2}, column {column!r}")
+            for i, row in rows
+        )
         for column in ("name", "direction", "node")
     )
     try:
@@ -78,14 +83,3 @@ def _number(path: Path, line: int, row: dict[str, Any], column: str) -> float:
             f"{path}, line {line + 2}, column {column!r}: expected a finite number; got {shown(row[column])}{remedy}"
         )
     return value
-
-
-def _text(path: Path, line: int, row: dict[str, Any], column: str, *, may_be_empty: bool = False) -> str:
-    value = row[column]
-    if value == "" and may_be_empty:
-        return ""
-    if not value or not value.isprintable() or len(value) > 255:
-        raise CaseError(
-            f"{path}, line {line + 2}, column {column!r}: expected up to 255 printable characters; got {shown(value)}"
-        )
-    return str(value)

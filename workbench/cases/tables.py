@@ -1,4 +1,4 @@
-"""Checked values of the tables of a case file."""
+"""Checked values of the tables of a case file; any other value is refused by a `CaseError`."""
 
 import re
 import tomllib
@@ -15,9 +15,7 @@ MOST_BYTES = 2**24
 MOST_ENTRIES = 1000
 MOST_LETTERS = 60  # of a word that is compared with those allowed
 NO_SYNONYMS: Mapping[str, str] = MappingProxyType({})
-
 _DEEP_KEY = re.compile(r"(?<![\w\"'-])(?:[\w\"'-]++[ \t]*+\.[ \t]*+){100}")
-
 _SINGLE = re.compile(r"^[ \t]*\[[ \t]*(input|output|record)[ \t]*\]", re.MULTILINE)
 
 _REPR = Repr()
@@ -31,11 +29,7 @@ class CaseError(ValueError):
 
 
 def table_of(path: Path) -> dict[str, Any]:
-    """The table of a TOML file.
-
-    Raises:
-        CaseError: the file is not TOML, or has more than `MOST_BYTES`.
-    """
+    """The table of a TOML file; any other file, or one of more than `MOST_BYTES`, is refused by a `CaseError`."""
     try:
         size = path.stat().st_size
         if size > MOST_BYTES:
@@ -61,11 +55,7 @@ def _brackets(key: str) -> str:
 
 
 def check_keys(entry: dict[str, Any], allowed: Iterable[str], where: str) -> None:
-    """Refuse an unknown key: a misspelt one would otherwise change the case unnoticed.
-
-    Raises:
-        CaseError: with the key, and the nearest allowed one.
-    """
+    """Refuse an unknown key by a `CaseError`: a misspelt one would otherwise change the case unnoticed."""
     allowed = list(allowed)
     for key in entry:
         if key not in allowed:
@@ -75,11 +65,7 @@ def check_keys(entry: dict[str, Any], allowed: Iterable[str], where: str) -> Non
 
 
 def tables(table: dict[str, Any], key: str, path: Path) -> list[dict[str, Any]]:
-    """The entries [[key]], whose names are unique.
-
-    Raises:
-        CaseError: no entries, too many, or two with the same name.
-    """
+    """The entries [[key]], at least one, with unique names."""
     entries = table.get(key)
     if isinstance(entries, dict):
         raise CaseError(f"{path}: [{key}] has one bracket; {_brackets(key)}")
@@ -100,11 +86,7 @@ def _got(entry: dict[str, Any], key: str) -> str:
 
 
 def text(entry: dict[str, Any], key: str, where: str) -> str:
-    """The text of printable characters under `key`.
-
-    Raises:
-        CaseError: the value is anything else.
-    """
+    """The text of printable characters under `key`."""
     value = entry.get(key)
     if not isinstance(value, str) or not value or not value.isprintable() or len(value) > 255:
         raise CaseError(f"{where}: {key} must be a text of up to 255 printable characters; {_got(entry, key)}")
@@ -114,22 +96,14 @@ def text(entry: dict[str, Any], key: str, where: str) -> str:
 def one_of(
     entry: dict[str, Any], key: str, allowed: Sequence[str], where: str, *, synonyms: Mapping[str, str] = NO_SYNONYMS
 ) -> str:
-    """The text under `key`, which must be one of those allowed.
-
-    Args:
-        entry, key, allowed, where: of the text.
-        synonyms: the allowed text by what others call it.
-
-    Raises:
-        CaseError: the value is anything else, with the text that is probably meant.
-    """
+    """The text under `key`, one of those allowed; synonyms, {what others say: allowed text}, help in the message."""
     value = text(entry, key, where)
     if value not in allowed:
-        raise CaseError(f"{where}: {key} is one of {', '.join(allowed)}; got {said(value, allowed, synonyms)}")
+        raise CaseError(f"{where}: {key} is one of {', '.join(allowed)}; got {suggesting(value, allowed, synonyms)}")
     return value
 
 
-def said(value: object, allowed: Iterable[str], synonyms: Mapping[str, str] = NO_SYNONYMS) -> str:
+def suggesting(value: object, allowed: Iterable[str], synonyms: Mapping[str, str] = NO_SYNONYMS) -> str:
     """A value that is not allowed, for a message, and the allowed text that is probably meant."""
     word = str(value).lower().replace("-", " ").replace("_", " ")[:MOST_LETTERS]
     if word in synonyms:
@@ -139,11 +113,7 @@ def said(value: object, allowed: Iterable[str], synonyms: Mapping[str, str] = NO
 
 
 def inside(folder: Path, file: str, where: str) -> Path:
-    """The path of a file named in a case, which must lie in the case folder.
-
-    Raises:
-        CaseError: the path leads outside the folder.
-    """
+    """The path of a file named in a case, which must lie in the case folder."""
     try:
         path = (folder / file).resolve()
     except (OSError, RuntimeError) as error:  # symbolic links that form a loop
@@ -154,46 +124,34 @@ def inside(folder: Path, file: str, where: str) -> Path:
 
 
 def number(entry: dict[str, Any], key: str, where: str, *, low: float = -np.inf) -> float:
-    """The finite number under `key`, at least `low`.
-
-    Raises:
-        CaseError: the value is anything else.
-    """
-    value = entry.get(key)
-    try:
-        as_float = float(value) if isinstance(value, int | float) and not isinstance(value, bool) else np.nan
-    except OverflowError:
-        as_float = np.inf
-    if not np.isfinite(as_float) or as_float < low:
+    """The finite number under `key`, at least `low`."""
+    value = _as_float(entry.get(key))
+    if not np.isfinite(value) or value < low:
         limit = "" if low == -np.inf else f" of {low:g} or more"
         raise CaseError(f"{where}: {key} must be a number{limit}; {_got(entry, key)}")
-    return as_float
+    return value
 
 
 def numbers(entry: dict[str, Any], key: str, where: str, length: int | None = None) -> np.ndarray:
-    """The list of finite numbers under `key`, of this length if given.
-
-    Raises:
-        CaseError: the value is anything else.
-    """
+    """The list of finite numbers under `key`, of this length if given."""
     given = entry.get(key)
-    plain = isinstance(given, list) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in given)
-    try:
-        values = np.array(given if plain else [], float)
-    except OverflowError:
-        values = np.zeros(0)
+    values = np.array([_as_float(value) for value in given] if isinstance(given, list) else [], float)
     if values.size == 0 or not np.isfinite(values).all() or values.size != (length or values.size):
         many = "numbers" if length is None else f"{length} numbers"
         raise CaseError(f"{where}: {key} must be a list of {many}; {_got(entry, key)}")
     return values
 
 
-def profile(entry: dict[str, Any], key: str) -> float | tuple[np.ndarray, np.ndarray]:
-    """The profile under `key`: a number, or points (x, value) with linear interpolation between them.
+def _as_float(value: object) -> float:
+    """A number as a float; infinite where it is too large, nan where it is no number."""
+    try:
+        return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else np.nan
+    except OverflowError:
+        return np.inf
 
-    Raises:
-        CaseError: the value is anything else.
-    """
+
+def profile(entry: dict[str, Any], key: str) -> float | tuple[np.ndarray, np.ndarray]:
+    """The profile under `key`: a number, or points (x, value) with linear interpolation between them."""
     value = entry.get(key)
     if isinstance(value, dict):
         check_keys(value, ("x", "value"), f"[structure] {key}")
@@ -202,11 +160,7 @@ def profile(entry: dict[str, Any], key: str) -> float | tuple[np.ndarray, np.nda
 
 
 def count(entry: dict[str, Any], key: str, most: int) -> int:
-    """The whole number from 1 to `most` under `key`.
-
-    Raises:
-        CaseError: the value is anything else.
-    """
+    """The whole number from 1 to `most` under `key`."""
     value = entry.get(key)
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
         raise CaseError(f"[structure]: {key} must be a whole number from 1 to {most}; {_got(entry, key)}")

@@ -1,9 +1,10 @@
 """Writing a case folder."""
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -14,17 +15,15 @@ from workbench.records.npz_file import write_arrays
 from workbench.records.units import SI
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig, Transducer, derivative_of
-from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import Between, NamedPoints, Patch, middle, position
 from workbench.structure.member import Beam, Structure
 from workbench.structure.modes import Modes
 from workbench.structure.plate import Plate
 from workbench.structure.profile import Profile
-from workbench.structure.supports import NAMED_EDGES, NAMED_ENDS, Edge, End
+from workbench.structure.supports import NAMED_EDGES, NAMED_ENDS, Support
 
 POINTS = "points.csv"
-Support = TypeVar("Support", End, Edge)
 
 
 def write_case(case: Case, folder: str | Path) -> Path:
@@ -40,7 +39,7 @@ def write_case(case: Case, folder: str | Path) -> Path:
     folder = Path(folder)
     (folder / "records").mkdir(parents=True, exist_ok=True)
     units = [] if case.units == SI else [_table("[units]", **asdict(case.units))]
-    blocks = [f"title = {_text(case.name)}", *units, *_rig(case.rig, folder)]
+    blocks = [f"title = {_value(case.name)}", *units, *_rig(case.rig, folder)]
     for record, use in [*((r, "fit") for r in case.fit), *((r, "validate") for r in case.validation)]:
         name = record.name.replace("%", "%25").replace("/", "%2F").replace("\\", "%5C")  # it names no folder
         file = f"records/{name}.npz"
@@ -73,15 +72,15 @@ def _rig(rig: Rig, folder: Path) -> list[str]:
 def _member(member: Structure, n_modes: int) -> str:
     if any(member.frequency_errors):
         raise ValueError("the case format has no frequency_errors of a structure: its frequencies are computed")
-    beam = isinstance(member, Beam)
+    kind = "beam" if isinstance(member, Beam) else "rod"
     profiles = {"mass_per_length": member.mass_per_length, member.stiffness_name: member.stiffness}
     return _table(
         "[structure]",
-        kind="beam" if beam else "rod",
+        kind=kind,
         length=member.length,
         **{name: _profile(profile, member.length, name) for name, profile in profiles.items()},
-        left=_end(member.left, beam),
-        right=_end(member.right, beam),
+        left=_named(member.left, ENDS[kind], NAMED_ENDS),
+        right=_named(member.right, ENDS[kind], NAMED_ENDS),
         damping_ratio=_damping_ratio(member),
         **({"tension": member.tension} if isinstance(member, Beam) and member.tension else {}),
         modes=n_modes,
@@ -146,10 +145,6 @@ def _profile(profile: Profile, length: float, name: str) -> float | dict[str, li
     return float(value[0]) if np.ptp(value) == 0 else {"x": x.tolist(), "value": value.tolist()}
 
 
-def _end(end: End, beam: bool) -> str:
-    return _named(end, ENDS["beam" if beam else "rod"], NAMED_ENDS)
-
-
 def _named(support: Support, names: tuple[str, ...], known: Mapping[str, Support]) -> str:
     for name in names:
         if known[name] == support:
@@ -158,31 +153,19 @@ def _named(support: Support, names: tuple[str, ...], known: Mapping[str, Support
 
 
 def _check_transducers(rig: Rig) -> None:
-    """Refuse properties of actuators, sensors and elements that a case file cannot describe.
-
-    Raises:
-        ValueError: with the name of the part, and what the format describes.
-    """
+    """Refuse properties of actuators, sensors and elements that a case file cannot describe, by a `ValueError`."""
     if rig.elements:
         raise ValueError(
             f"the case format has no elements of the nominal rig; take {type(rig.elements[0]).__name__} out"
         )
     moments = isinstance(rig.structure, Beam | Plate) or isinstance(rig.modes.domain, NamedPoints)
+    described = {"name", "at", "quantity", "direct", "noise_std"}
+    described |= set() if isinstance(rig.structure, Structure) else {"direction"}
     transducers: tuple[Transducer, ...] = (*rig.actuators, *rig.sensors)
     for transducer in transducers:
         moment = isinstance(transducer, Actuator) and transducer.quantity == "moment"
-        plain = (
-            Sensor(transducer.name, transducer.at)
-            if isinstance(transducer, Sensor)
-            else Actuator(transducer.name, transducer.at, transducer.quantity)
-        )
-        kept = ["direct"] if isinstance(transducer, Actuator) else ["quantity", "noise_std"]
-        kept += ["direction"] * (not isinstance(rig.structure, Structure))
-        other = [
-            f.name
-            for f in fields(transducer)
-            if f.name not in kept and getattr(transducer, f.name) != getattr(plain, f.name)
-        ]
+        changed = [f.name for f in fields(transducer) if getattr(transducer, f.name) != f.default]
+        other = [name for name in changed if name not in described]
         other += ["a moment"] * (moment and not moments)
         if other or (isinstance(transducer.at, Between) and not (moment and isinstance(rig.structure, Beam))):
             raise ValueError(
@@ -233,15 +216,9 @@ def _table(header: str, **entries: object) -> str:
 
 
 def _value(value: Any) -> str:
-    if isinstance(value, str):
-        return _text(value)
+    """A value in TOML, which writes texts, numbers and lists as JSON does."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key} = {_value(item)}" for key, item in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(_value(item) for item in value) + "]"
-    return repr(value) if isinstance(value, int) else repr(float(value))
-
-
-def _text(text: str) -> str:
-    kept = "".join(c if c.isprintable() else " " for c in text)
-    return '"' + kept.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(value, str):
+        value = "".join(c if c.isprintable() else " " for c in value)
+    return json.dumps(value, ensure_ascii=False, default=float)

@@ -85,14 +85,10 @@ def design(
             say(f"  {why}")
         else:
             share = None if perturbed is None else stable_share(perturbed, controller)
-            count = None if perturbed is None else len(perturbed)
-            sensed.append(_sensed(controller.name, explained, found, share, count))
+            sensed.append(_sensed(controller.name, explained, found, share, len(perturbed or ())))
     heads = ["controller", "decay rate, -max Re λ [1/s]", "limiting residual mode, Re λ", "path"]
-    heads += (
-        []
-        if perturbed is None or errors is None
-        else [f"stable of {len(perturbed)} models with {100 * errors:.3g} % error"]
-    )
+    if errors is not None and perturbed is not None:
+        heads.append(f"stable of {len(perturbed)} models with {100 * errors:.3g} % error")
     show_table(heads, [row for row, _ in sensed])
     write_json(
         json_path,
@@ -123,13 +119,13 @@ def design(
 
 
 def _sensed(
-    name: str, explained: "Explanation", rig: "Rig", share: float | None, count: int | None
+    name: str, explained: "Explanation", rig: "Rig", share: float | None, count: int
 ) -> tuple[list[str], dict[str, Any]]:
     """A controller that works through sensors, as a row of the table and as JSON; `share` of `count` is stable."""
     rate, stability = f"{explained.decay_rate:.3g}", explained.loop.stability
     limiting, path = _limit(explained, rig)
     row = [name, {"stable": rate, "unstable": f"{rate} unstable"}.get(stability, stability), limiting, path]
-    return row + ([] if share is None or count is None else [str(round(share * count))]), {
+    return row + ([] if share is None else [str(round(share * count))]), {
         "design": name,
         "margin": explained.decay_rate,  # the key of earlier files
         "stable": not explained.loop.unstable_poles.size,

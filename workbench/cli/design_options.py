@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from workbench.cli.options import DAMPING, ESTIMATORS
-from workbench.rig.rig import Rig
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig, derivative_of
 from workbench.structure.domain import Between, Domain, Interval, Location, NamedPoints, Patch, Place, PlaceError
 
 if TYPE_CHECKING:
@@ -28,9 +29,7 @@ def read_rig_and_units(path: Path) -> "tuple[Rig, Units]":
 def read_structure_rig(path: Path) -> "tuple[Rig, Units]":
     """As `read_rig_and_units`, with an actuator at a node moved to the point of its direction.
 
-    Raises:
-        ValueError: modal data without a table of points, whose shapes are known only at the inputs and outputs; or a
-            damping ratio of 1 or more.
+    Modal data whose shapes are known at the inputs and outputs alone, or a damping ratio of 1 or more, are refused.
     """
     found, units = read_rig_and_units(path)
     elastic = found.modes.zeta[found.modes.omega > 0]
@@ -47,21 +46,16 @@ def read_structure_rig(path: Path) -> "tuple[Rig, Units]":
             f'{path}: plain modal data have no shapes between points; name a file of points (points = "points.csv"), or'
             " describe a beam, a rod or a plate"
         )
-    actuators = [
-        replace(a, at=domain.slope(a.at, int(a.quantity == "moment"), a.direction)[0][0], direction=None)
-        if isinstance(a.at, str)
-        else a
-        for a in found.actuators
-    ]
-    return replace(found, actuators=tuple(actuators)), units
+
+    def at_point(a: Actuator) -> Actuator:
+        return replace(a, at=domain.slope(a.at, derivative_of(a), a.direction)[0][0], direction=None)
+
+    actuators = tuple(at_point(a) if isinstance(a.at, str) else a for a in found.actuators)
+    return replace(found, actuators=actuators), units
 
 
 def typed_place(domain: Domain, text: str, option: str) -> Place:
-    """The place of a text: a position in m along a beam, X,Y on a plate, or the name of a point.
-
-    Raises:
-        ValueError: another form; the message names the option.
-    """
+    """The place of a text: a position in m along a beam, X,Y on a plate, or the name of a point."""
     if isinstance(domain, NamedPoints):
         return text.strip()
     form = "a position in m, such as 0.4" if isinstance(domain, Interval) else "X,Y in m, such as 0.4,0.25"
@@ -75,11 +69,7 @@ def typed_place(domain: Domain, text: str, option: str) -> Place:
 
 
 def place_in(domain: Domain, text: str, option: str) -> Place:
-    """The place of a text, which must be on the structure.
-
-    Raises:
-        ValueError: another form, or a place outside the structure.
-    """
+    """The place of a text, which must be on the structure."""
     at = typed_place(domain, text, option)
     try:
         domain.locate(at)
@@ -105,11 +95,7 @@ def impulse_place(rig: Rig, at: str | None) -> Place:
 
 
 def check_rate(rate_hz: float | None) -> None:
-    """Refuse an invalid sample rate of the controller.
-
-    Raises:
-        ValueError: a rate that is not positive and finite.
-    """
+    """Refuse a sample rate of the controller that is not positive and finite, by a `ValueError`."""
     if rate_hz is not None and not 0 < rate_hz < float("inf"):
         raise ValueError(f"--rate-hz is the sample rate of the controller, above 0 Hz; got {rate_hz:g}")
 
@@ -129,11 +115,7 @@ def law_from(
     impulse_at: Location | None = None,
     impulse: float = 1.0,
 ) -> "Law | OnOffLaw":
-    """The law of this name, with a weight or a damping ratio.
-
-    Raises:
-        ValueError: both are given, or the law has no weight or no damping ratio.
-    """
+    """The law of this name, with a weight or a damping ratio; both, or one that the law has not, is refused."""
     from workbench.design.laws.coupled import coupled_lqr
     from workbench.design.laws.imsc import imsc
     from workbench.robust.plain_law import plain_law
@@ -172,11 +154,7 @@ def damping_by(modes: "Modes", law: "Law | OnOffLaw") -> str:
 def observed(
     rig: Rig, law: "Law | OnOffLaw", estimator: str, *, disturbance: float, sample_time: float
 ) -> "Controller":
-    """The law with an observer of all displacements and velocities, or a modal filter of places that have both.
-
-    Raises:
-        ValueError: an unknown estimator, an on-off law, or no such output.
-    """
+    """The law with an observer of all displacements and velocities, or a modal filter of places that have both."""
     from workbench.design.estimation.controller import filtered
     from workbench.design.estimation.modal_filter import filter_on
     from workbench.design.estimation.observers import kalman_controller, luenberger_controller, usual_poles

@@ -54,10 +54,7 @@ def diagnose(
         typer.Option("--uncorrected", help="Go on in spite of faults of wiring and units, without correcting them."),
     ] = False,
     transient: Annotated[
-        float,
-        typer.Option(
-            help="Time at the start of each record that is left out, where it starts in motion, s.",
-        ),
+        float, typer.Option(help="Time at the start of each record that is left out, where it starts in motion, s.")
     ] = 0.0,
     workers: options.Workers = None,
     seconds: Annotated[float, typer.Option(help="Processor time of the search, s; twice as long on one core.")] = 120.0,

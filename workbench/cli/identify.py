@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -47,8 +47,7 @@ def identify(
         typer.Option(metavar="NAME,NAME", help='Outputs to use; all unless given; "A, B" where a name holds a comma.'),
     ] = "",
     band_hz: Annotated[
-        tuple[float, float] | None,
-        typer.Option(metavar="LOW HIGH", help="Frequency band of FRFs to fit."),
+        tuple[float, float] | None, typer.Option(metavar="LOW HIGH", help="Frequency band of FRFs to fit.")
     ] = None,
     seconds: Annotated[float, typer.Option(help="Processor time of the search, s.")] = 30.0,
     memory: options.Memory = 1.0,
@@ -70,18 +69,9 @@ def identify(
     check_target(json_path, page=page)
     limits = ReadLimits.of_gib(memory)
     with reporting("reading") as report:
+        channels: Any = {"inputs": names_in(inputs), "outputs": names_in(outputs), "input_hold": input_hold}
         read = [
-            named_by_file(
-                read_measured(
-                    path,
-                    sample_rate_hz=sample_rate_hz,
-                    inputs=names_in(inputs),
-                    outputs=names_in(outputs),
-                    input_hold=input_hold,
-                    limits=limits,
-                ),
-                path,
-            )
+            named_by_file(read_measured(path, sample_rate_hz=sample_rate_hz, limits=limits, **channels), path)
             for path in records
         ]
         if input_hold is not None and not any(getattr(measured, "n_inputs", 0) for measured in read):

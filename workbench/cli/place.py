@@ -32,8 +32,7 @@ IN_JSON = {"residual_work_by_mode": "by_mode"}  # other names there
 def place(
     rig: options.RigPath,
     control: Annotated[
-        int,
-        typer.Option("--controlled-modes", help="Number of controlled modes, lowest first, and of actuators."),
+        int, typer.Option("--controlled-modes", help="Number of controlled modes, lowest first, and of actuators.")
     ],
     weight: options.Weight = 1.0,
     impulse_at: options.ImpulseAt = None,

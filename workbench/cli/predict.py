@@ -79,11 +79,7 @@ def predicted(
 
 
 def record_of(case: "Case", name: str, sample_rate_hz: float | None) -> Record:
-    """A record of the case by name, or a file with columns named as the case's inputs and outputs.
-
-    Raises:
-        ValueError: neither of these, or a column whose header states a unit of another quantity than the case's.
-    """
+    """A record of the case by name, or a file with columns named as the case's inputs and outputs, in its units."""
     from workbench.cases.case import check_units
     from workbench.records.files import read_record
 

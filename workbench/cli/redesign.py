@@ -52,16 +52,10 @@ def redesign(
         ),
     ] = None,
     max_cost_increase: Annotated[
-        float,
-        typer.Option(
-            help="Share by which a new controller that settles sooner may cost more than the present.",
-        ),
+        float, typer.Option(help="Share by which a new controller that settles sooner may cost more than the present.")
     ] = 0.01,
     max_work_increase: Annotated[
-        float,
-        typer.Option(
-            help="Share by which that controller may do more work; unlimited unless given.",
-        ),
+        float, typer.Option(help="Share by which that controller may do more work; unlimited unless given.")
     ] = float("inf"),
     draws: Annotated[
         int,

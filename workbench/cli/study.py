@@ -46,18 +46,17 @@ def study(
         chosen = [entry for entry in list_studies(here_first=True) if entry.defined and not entry.needs_data]
     else:
         chosen = [find_study(name)]
-    # a failed study does not stop the others
-    run = _run if len(chosen) == 1 else _run_one_of_several
-    if not all([run(entry, data, scheduler) for entry in chosen]):
+    succeeded = []
+    for entry in chosen:
+        try:
+            succeeded.append(_run(entry, data, scheduler))
+        except Exception as error:  # a failed study does not stop the others
+            if len(chosen) == 1:
+                raise
+            complain(f"{entry.name}: {type(error).__name__}: {with_notes(error)}")
+            succeeded.append(False)
+    if not all(succeeded):
         raise typer.Exit(FAILURE)
-
-
-def _run_one_of_several(found: "StudyFile", data: Path | None, scheduler: str | None) -> bool:
-    try:
-        return _run(found, data, scheduler)
-    except Exception as error:
-        complain(f"{found.name}: {type(error).__name__}: {with_notes(error)}")
-        return False
 
 
 def _run(found: "StudyFile", data: Path | None, scheduler: str | None) -> bool:

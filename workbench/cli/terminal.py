@@ -35,7 +35,6 @@ OPTIONS = {  # by argument, or by its words in a message, a regular expression
 PAGES, FIGURES = (".html", ".htm"), (".png", ".svg", ".pdf", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".eps", ".ps")
 WIDE = 150  # width of a table written to a file or a pipe
 
-
 # without markup: rich would take the unit in "acceleration [m/s^2]" for a style and drop it
 console = Console(soft_wrap=True, highlight=False, markup=False)
 if not console.is_terminal:
@@ -160,15 +159,9 @@ def show_table(headings: Sequence[str], rows: Iterable[Sequence[str]], *, right:
 
 
 def check_target(*paths: Path | None, page: Path | None = None, figure: Path | None = None) -> None:
-    """Refuse paths that cannot be written, before the computation.
+    """Refuse paths that cannot be written, or a suffix of another format, before the computation.
 
-    Args:
-        paths: files in folders that exist.
-        page: an HTML file, whose folder is made if there is none.
-        figure: an image, of which the suffix alone is checked.
-
-    Raises:
-        ValueError: a folder, a file in a folder that does not exist or cannot be made, or a suffix of another format.
+    The folder of a page is made if there is none; of a figure the suffix alone is checked.
     """
     if page is not None and not page.is_dir() and page.suffix.lower() not in PAGES:
         raise ValueError(f"--page writes HTML; name a file such as {page.stem}.html; got {page.name}")
@@ -181,9 +174,9 @@ def check_target(*paths: Path | None, page: Path | None = None, figure: Path | N
     for path in filter(None, paths):
         if not path.parent.is_dir():
             raise ValueError(f"{path}: there is no folder {path.parent}; make it first")
-    is_file = next((folder for folder in page.parents if folder.is_file()), None) if page else None
-    if is_file is not None:
-        raise ValueError(f"{page}: {is_file} is a file, not a folder; name another place")
+    for folder in page.parents if page else ():
+        if folder.is_file():
+            raise ValueError(f"{page}: {folder} is a file, not a folder; name another place")
 
 
 def write_json(path: Path | None, content: Mapping[str, Any]) -> None:

@@ -19,10 +19,8 @@ def uncertain_rig(
 ) -> "tuple[UncertainRig, tuple[float, ...] | None]":
     """The uncertain rig of a case, and the noise (n_outputs,) estimated by its diagnosis, which is run unless given.
 
-    A new verdict is written to out/NAME-verdict.json.
-
-    Raises:
-        ValueError: the verdict is of another case, or the set-up has certain faults, such as swapped channels.
+    A new verdict is written to out/NAME-verdict.json. Certain faults of the set-up, such as swapped channels, are
+    refused.
     """
     from workbench.gap.diagnose import SECONDS
     from workbench.gap.diagnose_case import diagnose_case
@@ -60,11 +58,7 @@ def write_verdict(verdict: "Verdict", path: Path) -> None:
 
 
 def read_verdict(path: Path, rig: Rig) -> "tuple[UncertainRig, tuple[float, ...] | None]":
-    """The uncertain rig of a verdict in JSON, and the estimated noise (n_outputs,).
-
-    Raises:
-        ValueError: no such file, or none that is a verdict of this case.
-    """
+    """The uncertain rig of a verdict in JSON, which must be of this rig, and the estimated noise (n_outputs,)."""
     from workbench.robust.posterior import UncertainRig
 
     if not path.is_file():

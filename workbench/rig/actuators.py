@@ -91,36 +91,23 @@ Actuator.__init__ = former_arguments(kind="quantity")(Actuator.__init__)  # type
 
 
 def mixed(actuators: Sequence[Actuator], commands: Floats) -> Floats:
-    """Commands (n_actuators, n_samples) with cross-talk; the same array if there is none.
-
-    Raises:
-        ValueError: a share of a command that is not among these, or of a measured force.
-    """
+    """Commands (n_actuators, n_samples) with cross-talk; the same array if there is none."""
     if not any(actuator.crosstalk for actuator in actuators):
         return commands
     names, taken = [actuator.name for actuator in actuators], commands.copy()
     for j, actuator in enumerate(actuators):
         for name, share in actuator.crosstalk:
+            takes = f"actuator {actuator.name} takes a share of the command of {name!r}, which is"
             if name not in names:
-                raise ValueError(
-                    f"actuator {actuator.name} takes a share of the command of {name!r}, which is no actuator of the"
-                    " rig"
-                )
+                raise ValueError(f"{takes} no actuator of the rig")
             if actuators[names.index(name)].direct:
-                raise ValueError(
-                    f"actuator {actuator.name} takes a share of the command of {name!r}, which is a measured force"
-                    " without a command"
-                )
+                raise ValueError(f"{takes} a measured force without a command")
             taken[j] += share * commands[names.index(name)]
     return taken
 
 
 def mixing(actuators: Sequence[Actuator]) -> Floats:
-    """Cross-talk as a matrix (n_actuators, n_actuators): the command that each actuator takes per command sent.
-
-    Raises:
-        ValueError: as of `mixed`.
-    """
+    """Cross-talk as a matrix (n_actuators, n_actuators): the command that each actuator takes per command sent."""
     return mixed(actuators, np.eye(len(actuators)))
 
 

@@ -28,12 +28,7 @@ R = TypeVar("R")
 
 
 def actuator_force(actuator: Actuator, command: np.ndarray) -> np.ndarray:
-    """The static force of an actuator: hysteresis, gain, dead zone, saturation, before rate limit, delay and lag.
-
-    Args:
-        actuator: of the force.
-        command: (n_samples,) with its cross-talk.
-    """
+    """The static force (n_samples,) of a command with its cross-talk: hysteresis, gain, dead zone and saturation."""
     if actuator.hysteresis_share:
         share = actuator.hysteresis_share
         hysteretic = hysteresis(np.r_[0.0, command], actuator.hysteresis_width)[1:]
@@ -63,7 +58,7 @@ def _ramped(targets: Floats, most: float) -> tuple[Floats, Floats]:
     return mean, start
 
 
-class Piece(NamedTuple):
+class Term(NamedTuple):
     """A force size t^power e^(-rate t), t the time from its beginning within a substep.
 
     Attributes:
@@ -79,13 +74,13 @@ class Piece(NamedTuple):
     power: int = 0
 
 
-Course = tuple[Piece, ...]  # a force over a substep, as a sum
+Waveform = tuple[Term, ...]  # a force over a substep, as a sum
 
 
-def _linearised(course: Course, h: float) -> tuple[float, float]:
+def _linearised(waveform: Waveform, h: float) -> tuple[float, float]:
     """Mean and half the rise over a substep of the linear force of the same mean and first moment."""
     mean = moment = 0.0
-    for begins, rate, size, power in course:
+    for begins, rate, size, power in waveform:
         lasts = h - begins
         area, first = lasts ** (power + 1) / (power + 1), lasts ** (power + 2) / (power + 2)
         if rate:
@@ -97,16 +92,16 @@ def _linearised(course: Course, h: float) -> tuple[float, float]:
     return mean, 6.0 * moment
 
 
-def motion_correction(course: Course, omega: Floats, damping: Floats, h: float) -> Floats:
+def motion_correction(waveform: Waveform, omega: Floats, damping: Floats, h: float) -> Floats:
     """Difference (2, n_modes) in q and q' at the end of a substep between a force and its linear replacement."""
     linear = np.empty((2, 4, omega.size))
     propagators(omega, damping, h, linear)
     root = np.sqrt((0.5 * damping) ** 2 - omega**2 + 0j)
     root[np.abs(root) * h < ALIKE] = ALIKE / h
     poles = -0.5 * damping + np.array([1.0, -1.0])[:, None] * root
-    mean, rise = _linearised(course, h)
+    mean, rise = _linearised(waveform, h)
     response = np.zeros_like(poles)
-    for begins, rate, size, power in course:
+    for begins, rate, size, power in waveform:
         lasts = h - begins
         response += size * lasts ** (power + 1) * _convolution(poles * lasts, rate * lasts, power)
     both = np.array([response[0] - response[1], poles[0] * response[0] - poles[1] * response[1]]) / (2.0 * root)
@@ -122,25 +117,6 @@ def _convolution(pole: Complexes, rate: float, power: int) -> Complexes:
     return np.where(near, series, (np.exp(pole) - 1.0 - pole) / x**2 if power else (np.exp(pole) - np.exp(-rate)) / x)
 
 
-class Drives(NamedTuple):
-    """Forces of the actuators over the substeps.
-
-    Attributes:
-        driven: (n_actuators,) which actuators ever exert a force.
-        starts, ends: (n_driven, n_samples * substeps) linear forces at the start and the end of each substep.
-        at_samples: (n_actuators, n_samples) forces at the samples.
-        courses: (actuator, course) of unit delayed or lagged forces, which are not linear.
-        sizes: (n_courses, n_samples * substeps) of these in each substep.
-    """
-
-    driven: Flags
-    starts: Floats
-    ends: Floats
-    at_samples: Floats
-    courses: tuple[tuple[int, Course], ...]
-    sizes: Floats
-
-
 class _Inputs:
     """A read-only array as a key of a cache, compared by identity."""
 
@@ -154,9 +130,7 @@ class _Inputs:
         return isinstance(other, _Inputs) and self.values is other.values
 
 
-def cached_for_records(
-    function: Callable[Concatenate[Floats, int, P], R],
-) -> Callable[Concatenate[Floats, int, P], R]:
+def cached_for_records(function: Callable[Concatenate[Floats, int, P], R]) -> Callable[Concatenate[Floats, int, P], R]:
     """A function of inputs and of steps per sample that is cached for the inputs of a record, which are read-only.
 
     Structure and sensors of a rig change more often.
@@ -180,8 +154,14 @@ on_finer_steps = cached_for_records(finer)
 @cached_for_records
 def drives(
     inputs: Floats, substeps: int, actuators: tuple[Actuator, ...], sample_time: float, input_hold: str
-) -> Drives:
-    """The forces of the actuators over the substeps, for inputs (n_actuators, n_samples)."""
+) -> tuple[Flags, Floats, Floats, Floats, tuple[tuple[int, Waveform], ...], Floats]:
+    """The forces of the actuators over the substeps, for inputs (n_actuators, n_samples).
+
+    Returns:
+        Which actuators ever exert a force (n_actuators,); their linear forces at the start and at the end of each
+        substep (n_driven, n_samples * substeps); the forces at the samples (n_actuators, n_samples); and (actuator,
+        waveform) of unit delayed or lagged forces, which are not linear, with their sizes in each substep.
+    """
     h = sample_time / substeps
     mean = np.empty((inputs.shape[0], inputs.shape[1] * substeps))
     rise = np.zeros_like(mean)  # half of it, over a substep
@@ -206,12 +186,12 @@ def drives(
             start = edges[:-1]
             mean[j], rise[j] = 0.5 * (start + edges[1:]), 0.5 * np.diff(edges)
         if actuator.delay or actuator.time_constant:
-            mean[j], rise[j], start, courses = _delayed_and_lagged(mean[j], rise[j], start, actuator, h)
-            for course, size in courses:
-                unit_mean, unit_rise = _linearised(course, h)
+            mean[j], rise[j], start, waveforms = _delayed_and_lagged(mean[j], rise[j], start, actuator, h)
+            for waveform, size in waveforms:
+                unit_mean, unit_rise = _linearised(waveform, h)
                 mean[j] += unit_mean * size
                 rise[j] += unit_rise * size
-                nonlinear.append((j, course, size))
+                nonlinear.append((j, waveform, size))
         mean[j] += actuator.bias
         at_samples[j] = start[::substeps] + actuator.bias
     starts, ends = mean - rise, mean + rise
@@ -219,36 +199,30 @@ def drives(
     acting = [each for each in nonlinear if np.abs(each[2]).max(initial=0.0) * h ** each[1][0].power > least]
     sizes = np.array([size for *_, size in acting]).reshape(len(acting), mean.shape[1])
     driven = np.logical_or(starts.any(axis=1), ends.any(axis=1))
-    of_acting = tuple((j, course) for j, course, _ in acting)
-    return Drives(driven, starts[driven], ends[driven], at_samples, of_acting, sizes)
+    of_acting = tuple((j, waveform) for j, waveform, _ in acting)
+    return driven, starts[driven], ends[driven], at_samples, of_acting, sizes
 
 
 def _delayed_and_lagged(
     mean: Floats, rise: Floats, start: Floats, actuator: Actuator, h: float
-) -> tuple[Floats, Floats, Floats, list[tuple[Course, Floats]]]:
-    """Forces that are linear over substeps, after delay and lag.
+) -> tuple[Floats, Floats, Floats, list[tuple[Waveform, Floats]]]:
+    """Forces that are linear over substeps of h, after the delay and the lag of an actuator.
 
-    Args:
-        mean, rise: of each substep, half the rise.
-        start: force at the start of each, which differs from mean - rise where a ramp ends within the substep.
-        actuator: has the delay and the lag.
-        h: substep, s.
-
-    Returns:
-        Mean and half the rise of the linear part; the force at each start; and unit courses of the rest, with sizes.
+    Each has its mean, half its rise, and its start, which differs from mean - rise where a ramp ends within the
+    substep. Returned are those of the linear part, and unit waveforms of the rest, with sizes.
     """
     shift, late = whole_samples(actuator.delay, h)
     old_mean, old_rise = (shifted(each, shift + 1) for each in (mean, rise))
     mean, rise, start = (shifted(each, shift) for each in (mean, rise, start))
-    courses: list[tuple[Course, Floats]] = []
+    waveforms: list[tuple[Waveform, Floats]] = []
     if late:  # the force of the previous substep continues until the delay has passed
         before, until = old_mean + old_rise * (1.0 - 2.0 * late / h), old_mean + old_rise
         jump, bend = mean - rise - until, 2.0 * (rise - old_rise) / h
-        courses = [((Piece(late, 0.0, 1.0),), jump), ((Piece(late, 0.0, 1.0, 1),), bend)]
+        waveforms = [((Term(late, 0.0, 1.0),), jump), ((Term(late, 0.0, 1.0, 1),), bend)]
         mean, rise, start = before + old_rise, old_rise, before
     lag = actuator.time_constant
     if lag == 0:
-        return mean, rise, start, courses
+        return mean, rise, start, waveforms
     # y + T y' = u: the particular solution of each part of u, and an exponential
     slope = 2.0 * rise / h
     settled, fade = mean - rise - lag * slope, np.exp(-h / lag)
@@ -256,23 +230,19 @@ def _delayed_and_lagged(
     if late:
         remaining, decay = h - late, np.exp(-(h - late) / lag)
         new = new + jump * (1.0 - decay) + bend * (remaining - lag * (1.0 - decay))
-        courses = [
-            ((Piece(late, 0.0, 1.0), Piece(late, 1.0 / lag, -1.0)), jump),
-            ((Piece(late, 0.0, 1.0, 1), Piece(late, 0.0, -lag), Piece(late, 1.0 / lag, lag)), bend),
+        waveforms = [
+            ((Term(late, 0.0, 1.0), Term(late, 1.0 / lag, -1.0)), jump),
+            ((Term(late, 0.0, 1.0, 1), Term(late, 0.0, -lag), Term(late, 1.0 / lag, lag)), bend),
         ]
     acting = np.r_[0.0, lfilter([1.0], [1.0, -fade], new)[:-1]]
-    courses.append(((Piece(0.0, 1.0 / lag, 1.0),), acting - settled))
-    return mean - lag * slope, rise, acting, courses
+    waveforms.append(((Term(0.0, 1.0 / lag, 1.0),), acting - settled))
+    return mean - lag * slope, rise, acting, waveforms
 
 
 def sinusoid_on_substeps(
     element: PeriodicForce, n_samples: int, sample_time: float, substeps: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A sinusoid's linear replacement over each substep, of the same mean and first moment, and its values at samples.
-
-    Returns:
-        Starts and ends (n_samples * substeps,), and values (n_samples,).
-    """
+    """Starts and ends (n_samples * substeps,) of a sinusoid's linear replacement, and its values (n_samples,)."""
     omega, h = 2 * np.pi * element.frequency_hz, sample_time / substeps
     edges = omega * h * np.arange(n_samples * substeps + 1) + element.phase
     middle, half = 0.5 * (edges[:-1] + edges[1:]), 0.5 * omega * h

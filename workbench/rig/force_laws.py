@@ -28,6 +28,7 @@ LAWS: dict[type[elements.PointElement], int] = {
     elements.BoucWen: BOUC_WEN,
     elements.UserLaw: USER,
 }
+Laws = tuple[Integers, Floats]  # kinds (n_elements,) and parameters (n_elements, n_parameters)
 N_PARAMETERS = 3  # of a law, at most
 SETTLED = 1e-10  # relative tolerance of a force
 
@@ -126,22 +127,13 @@ def element_force(
 
 @njit(cache=True, nogil=True)
 def _solve_one(
-    kind: int,
-    parameters: Floats,
-    i: int,
-    w0: float,
-    v0: float,
-    aw: float,
-    av: float,
-    z: float,
-    w_old: float,
-    start: float,
+    laws: Laws, i: int, w0: float, v0: float, aw: float, av: float, z: float, w_old: float, start: float
 ) -> float:
     """The force f of element i with f = law(w0 + aw f, v0 + av f): Newton, safeguarded by bisection."""
-    f = start
-    low, high = -math.inf, math.inf
+    kinds, parameters = laws
+    f, low, high = start, -math.inf, math.inf
     for _ in range(40):
-        value, by_w, by_v = element_force(kind, parameters, i, w0 + aw * f, v0 + av * f, z, w_old)
+        value, by_w, by_v = element_force(kinds[i], parameters, i, w0 + aw * f, v0 + av * f, z, w_old)
         g = f - value
         if abs(g) <= _close(f, value):
             break
@@ -152,10 +144,7 @@ def _solve_one(
         slope = 1.0 - by_w * aw - by_v * av
         f_new = f - g / slope if slope > 0.1 else value
         if not (low < f_new < high):
-            if low > -math.inf and high < math.inf:
-                f_new = 0.5 * (low + high)
-            else:
-                f_new = value
+            f_new = 0.5 * (low + high) if low > -math.inf and high < math.inf else value
         if f_new == f:
             break
         f = f_new
@@ -164,18 +153,11 @@ def _solve_one(
 
 @njit(cache=True, nogil=True)
 def _solve_pair(
-    kinds: Integers,
-    parameters: Floats,
-    w_free: Floats,
-    v_free: Floats,
-    aw: Floats,
-    av: Floats,
-    z: Floats,
-    w_old: Floats,
-    f: float,
-    g: float,
-) -> tuple[float, float, bool]:
-    """The forces of two elements by Newton's method from f and g, and whether it converged."""
+    laws: Laws, w_free: Floats, v_free: Floats, aw: Floats, av: Floats, z: Floats, w_old: Floats, force: Floats
+) -> bool:
+    """Solve the forces of two elements in place by Newton's method; False, with the guess, where it diverges."""
+    kinds, parameters = laws
+    f, g = force[0], force[1]
     for _ in range(6):
         w, v = w_free[0] + aw[0, 0] * f + aw[0, 1] * g, v_free[0] + av[0, 0] * f + av[0, 1] * g
         law_f, f_w, f_v = element_force(kinds[0], parameters, 0, w, v, z[0], w_old[0])
@@ -183,7 +165,8 @@ def _solve_pair(
         law_g, g_w, g_v = element_force(kinds[1], parameters, 1, w, v, z[1], w_old[1])
         off_f, off_g = law_f - f, law_g - g
         if abs(off_f) <= _close(law_f, f) and abs(off_g) <= _close(law_g, g):
-            return f, g, True
+            force[0], force[1] = f, g
+            return True
         ff, fg = 1.0 - f_w * aw[0, 0] - f_v * av[0, 0], -f_w * aw[0, 1] - f_v * av[0, 1]
         gf, gg = -g_w * aw[1, 0] - g_v * av[1, 0], 1.0 - g_w * aw[1, 1] - g_v * av[1, 1]
         determinant = ff * gg - fg * gf
@@ -192,7 +175,7 @@ def _solve_pair(
             break
         f += (gg * off_f - fg * off_g) / determinant
         g += (ff * off_g - gf * off_f) / determinant
-    return f, g, False
+    return False
 
 
 @njit(cache=True, nogil=True)
@@ -201,65 +184,37 @@ def _close(one: float, other: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _solve_in_turn(
-    kinds: Integers,
-    parameters: Floats,
-    w_free: Floats,
-    v_free: Floats,
-    aw: Floats,
-    av: Floats,
-    z: Floats,
-    w_old: Floats,
-    force: Floats,
-) -> None:
-    """Solve the forces of all elements in place, one after the other until none changes (Gauss-Seidel)."""
-    for _ in range(12):
-        largest = 0.0
-        for i in range(kinds.size):
-            w0, v0 = w_free[i], v_free[i]
-            for j in range(kinds.size):
-                if j != i:
-                    w0 += aw[i, j] * force[j]
-                    v0 += av[i, j] * force[j]
-            f = _solve_one(kinds[i], parameters, i, w0, v0, aw[i, i], av[i, i], z[i], w_old[i], force[i])
-            largest = max(largest, abs(f - force[i]) / (abs(f) + 1e-30))
-            force[i] = f
-        if largest < SETTLED:
-            break
-
-
-@njit(cache=True, nogil=True)
 def solve_laws(
-    kinds: Integers,
-    parameters: Floats,
-    w_free: Floats,
-    v_free: Floats,
-    aw: Floats,
-    av: Floats,
-    z: Floats,
-    w_old: Floats,
-    force: Floats,
+    laws: Laws, w_free: Floats, v_free: Floats, aw: Floats, av: Floats, z: Floats, w_old: Floats, force: Floats
 ) -> None:
     """Solve force = law(w_free + aw force, v_free + av force) for the forces (n_elements,), in place from a guess.
 
     Args:
-        kinds, parameters: of the laws; see `law_arrays`.
+        laws: see `law_arrays`.
         w_free, v_free: (n_elements,) displacements and velocities without these forces.
         aw, av: (n_elements, n_elements) displacements and velocities per unit force.
         z, w_old: (n_elements,) hysteretic displacements, and displacements, at the start of the substep.
         force: (n_elements,) the guess, and the solution.
     """
-    if kinds.size == 1:
-        force[0] = _solve_one(
-            kinds[0], parameters, 0, w_free[0], v_free[0], aw[0, 0], av[0, 0], z[0], w_old[0], force[0]
-        )
+    n = force.size
+    if n == 1:
+        force[0] = _solve_one(laws, 0, w_free[0], v_free[0], aw[0, 0], av[0, 0], z[0], w_old[0], force[0])
         return
-    if kinds.size == 2:
-        f, g, settled = _solve_pair(kinds, parameters, w_free, v_free, aw, av, z, w_old, force[0], force[1])
-        if settled:
-            force[0], force[1] = f, g
-            return
-    _solve_in_turn(kinds, parameters, w_free, v_free, aw, av, z, w_old, force)
+    if n == 2 and _solve_pair(laws, w_free, v_free, aw, av, z, w_old, force):
+        return
+    for _ in range(12):  # one after the other until none changes (Gauss-Seidel)
+        largest = 0.0
+        for i in range(n):
+            w0, v0 = w_free[i], v_free[i]
+            for j in range(n):
+                if j != i:
+                    w0 += aw[i, j] * force[j]
+                    v0 += av[i, j] * force[j]
+            f = _solve_one(laws, i, w0, v0, aw[i, i], av[i, i], z[i], w_old[i], force[i])
+            largest = max(largest, abs(f - force[i]) / (abs(f) + 1e-30))
+            force[i] = f
+        if largest < SETTLED:
+            break
 
 
 @cache  # kept alive as long as this process

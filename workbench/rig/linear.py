@@ -127,9 +127,7 @@ def held_response(
         system: the poles.
         forces: (n_inputs, n_samples) values held from t_k to t_k+1.
         participation: (n_modes, n_inputs) modal forces per unit input.
-        sample_time: s.
-        delay: s, common to these inputs, before the lag.
-        time_constant: of the first-order lag, s.
+        sample_time, delay, time_constant: s, the delay common to these inputs, before the first-order lag.
 
     Returns:
         s (n_poles, n_samples), and the forces that act at the sample instants (n_inputs, n_samples).
@@ -171,7 +169,7 @@ def held_response(
     return response, acting
 
 
-def straight_response(
+def first_order_hold_response(
     system: ModalPoles,
     forces: np.ndarray,
     participation: np.ndarray,

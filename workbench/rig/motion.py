@@ -147,12 +147,9 @@ class BetweenSamples:
             self.arrivals = self.arrivals - np.concatenate([row[:, None] * step.forces[:, :-1] for row in added[:2]])
 
     def delayed(self, order: int, shapes: Floats, delays: Floats) -> Floats:
-        """Readings (n_sensors, n_samples) of delayed sensors; zero before a start at rest.
+        """Readings (n_sensors, n_samples) after delays (n_sensors,), s, negative ones too; zero before a start at rest.
 
-        Args:
-            order: 0 for displacement, 1 for velocity, 2 for acceleration.
-            shapes: (n_sensors, n_modes) at the sensors.
-            delays: (n_sensors,) s; negative for a sensor ahead of the samples.
+        They are displacements (order 0), velocities (1) or accelerations (2) at shapes (n_sensors, n_modes).
         """
         in_samples = [delay / self.sample_time for delay in delays]
         # samples back to the start of each one's interval, and time within it, rounded: a tiny one would be a divisor

@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from workbench.arrays import Floats, Integers
 from workbench.rig.motion import Motion
 from workbench.rig.rig import KEPT, Rig, shapes_at
-from workbench.rig.sensors import MEASURED, Sensor
+from workbench.rig.sensors import MEASURED, Sensor, crosstalk_between
 
 DERIVATIVES = ("displacement", "velocity", "acceleration")  # in time, by order
 
@@ -32,18 +32,15 @@ def _shapes(rig: Rig) -> Floats:
 
 def read(rig: Rig, motion: Motion) -> Floats:
     """Noise-free readings (n_sensors, n_samples) of a motion, clipped, and with the mean effect of rounding."""
-    shapes, names = _shapes(rig), [sensor.name for sensor in rig.sensors]
+    shapes, crosstalk = _shapes(rig), crosstalk_between(rig.sensors)
     truths = _delayed(rig, motion, rig.sensors, shapes)
-    outputs = truths.copy() if any(sensor.crosstalk for sensor in rig.sensors) else truths
+    outputs = truths.copy() if crosstalk else truths
+    for j, i, share in crosstalk:
+        sensor, source = rig.sensors[j], rig.sensors[i]
+        as_late = replace(source, delay=sensor.delay, interpolated=sensor.interpolated)
+        taken = truths[i] if as_late == source else _delayed(rig, motion, (as_late,), shapes[[i]])[0]
+        outputs[j] += share * taken
     for j, sensor in enumerate(rig.sensors):
-        for name, share in sensor.crosstalk:
-            if name not in names:
-                raise ValueError(f"sensor {sensor.name} reads a share of {name!r}, which is no sensor of the rig")
-            i = names.index(name)
-            source = rig.sensors[i]
-            as_late = replace(source, delay=sensor.delay, interpolated=sensor.interpolated)
-            taken = truths[i] if as_late == source else _delayed(rig, motion, (as_late,), shapes[[i]])[0]
-            outputs[j] += share * taken
         outputs[j] = sensor_reading(sensor, outputs[j], motion.sample_time)
     return outputs
 

@@ -9,7 +9,7 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.records.record import QUANTITIES, Channel, Record
 from workbench.rig.actuators import Actuator, force_unit
-from workbench.rig.elements import Element
+from workbench.rig.elements import AirDrag, Element, MidplaneStretching
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.domain import Between, NamedPoints, Patch, PlaceError, check_place
 from workbench.structure.member import Structure
@@ -25,21 +25,20 @@ Transducer = Actuator | Sensor
 
 def derivative_of(transducer: Transducer) -> int:
     """Order of the shapes' spatial derivative at an actuator or sensor: 1 for a moment or a slope, else 0."""
-    return (
-        int(transducer.quantity == "moment") if isinstance(transducer, Actuator) else MEASURED[transducer.quantity][0]
-    )
+    if isinstance(transducer, Actuator):
+        return int(transducer.quantity == "moment")
+    return MEASURED[transducer.quantity][0]
 
 
 def shape_of(modes: Modes, transducer: Transducer) -> Floats:
     """Mode shapes, or their slopes, at an actuator or a sensor: (n_modes,), without its gain, with its `shape_error`.
 
-    Raises:
-        PlaceError: a place or direction that the structure does not have; the message names the actuator or sensor.
+    A place or direction that the structure does not have is refused by a `PlaceError` that names the transducer.
     """
     try:
         shape = modes.phi_at(transducer.at, derivative_of(transducer), direction=transducer.direction)
     except PlaceError as error:
-        raise _misplaced(transducer, error) from None
+        raise PlaceError(f"{transducer_text(transducer)}: {error}") from None
     return shape + _shape_error(transducer, modes.n_modes) if transducer.shape_error else shape
 
 
@@ -68,9 +67,9 @@ def _shape_error(transducer: Transducer, n_modes: int) -> Floats:
     return np.pad(known, (0, n_modes - len(known)))
 
 
-def _misplaced(transducer: Transducer, error: PlaceError) -> PlaceError:
-    what = "actuator" if isinstance(transducer, Actuator) else "sensor"
-    return PlaceError(f"{what} {transducer.name}: {error}")
+def transducer_text(transducer: Transducer) -> str:
+    """Text of an actuator or a sensor, such as "actuator F1"."""
+    return f"{'actuator' if isinstance(transducer, Actuator) else 'sensor'} {transducer.name}"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -108,23 +107,15 @@ class Rig(Printed):
             names = [part.name for part in parts]
             if len(set(names)) != len(names):
                 raise ValueError(f"the {name} of a rig must have different names; got {names}")
-        self._check_places()
-
-    def _check_places(self) -> None:
-        domain = self.modes.domain
-        transducers: tuple[Transducer, ...] = (*self.actuators, *self.sensors)
-        for transducer in transducers:
+        for part in (*self.actuators, *self.sensors, *self.elements):
             try:
-                check_place(domain, transducer.at, derivative_of(transducer), transducer.direction)
+                if isinstance(part, Transducer):
+                    check_place(self.modes.domain, part.at, derivative_of(part), part.direction)
+                elif not isinstance(part, AirDrag | MidplaneStretching):
+                    check_place(self.modes.domain, part.at)
             except PlaceError as error:
-                raise _misplaced(transducer, error) from None
-        for element in self.elements:
-            where = getattr(element, "at", None)  # None of a distributed element
-            if where is not None:
-                try:
-                    check_place(domain, where)
-                except PlaceError as error:
-                    raise PlaceError(f"element {type(element).__name__}: {error}") from None
+                what = transducer_text(part) if isinstance(part, Transducer) else f"element {type(part).__name__}"
+                raise PlaceError(f"{what}: {error}") from None
 
     def record(
         self, inputs: Floats, outputs: Floats, *, sample_time: float, name: str, input_hold: str = "zero"
@@ -157,13 +148,8 @@ class Rig(Printed):
         rows = [(a.name, "actuator", a.quantity, place_text(a.at), _properties(a)) for a in self.actuators]
         rows += [(s.name, "sensor", s.quantity, place_text(s.at), _properties(s)) for s in self.sensors]
         rows += [("", "element", type(e).__name__, place_text(getattr(e, "at", None)), "") for e in self.elements]
-        headings = (
-            "name",
-            "",
-            "quantity",
-            "at" if isinstance(self.modes.domain, NamedPoints) else "at [m]",
-            "properties",
-        )
+        at = "at" if isinstance(self.modes.domain, NamedPoints) else "at [m]"
+        headings = ("name", "", "quantity", at, "properties")
         shown = len(headings) - (not any(row[-1] for row in rows))  # all are as by default
         parts = ((self.actuators, "actuator"), (self.sensors, "sensor"), (self.elements, "element"))
         line = ", ".join([counted(self.modes.n_modes, "mode"), *(counted(len(each), word) for each, word in parts)])

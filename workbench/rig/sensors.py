@@ -1,5 +1,6 @@
 """Sensors: quantity, place and imperfections."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -78,6 +79,16 @@ class Sensor(Constructed):
     def has_state_space(self) -> bool:
         """Whether the reading is linear in the measured quantities with finitely many states, so without a delay."""
         return bool(np.isinf(self.limit) and not (self.bias or self.drift or self.step or self.delay))
+
+
+def crosstalk_between(sensors: Sequence[Sensor]) -> list[tuple[int, int, float]]:
+    """Cross-talk of sensors, (index, index of the other, share); an unknown name is refused by a `ValueError`."""
+    names = [sensor.name for sensor in sensors]
+    for sensor in sensors:
+        for name, _ in sensor.crosstalk:
+            if name not in names:
+                raise ValueError(f"sensor {sensor.name} reads a share of {name!r}, which is no sensor of the rig")
+    return [(j, names.index(name), share) for j, sensor in enumerate(sensors) for name, share in sensor.crosstalk]
 
 
 def linear_sensor(sensor: Sensor) -> Sensor:

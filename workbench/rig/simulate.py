@@ -14,12 +14,12 @@ from workbench.rig.elements import PeriodicForce, RandomForce
 from workbench.rig.lanes import on_lanes
 from workbench.rig.linear import (
     ModalPoles,
+    first_order_hold_response,
     held_response,
     modal_motion,
     modal_poles,
     shifted,
     sinusoid_response,
-    straight_response,
     whole_samples,
 )
 from workbench.rig.motion import Motion, Step
@@ -127,7 +127,7 @@ def _move_exactly(
     system, inputs = _poles(modes), mixed(rig.actuators, inputs)
     responses: list[Complexes] = []
     acting = np.zeros((inputs.shape[0], inputs.shape[1] // every))
-    response_to = held_response if input_hold == "zero" else partial(straight_response, every=every)
+    response_to = held_response if input_hold == "zero" else partial(first_order_hold_response, every=every)
     for delay, lag in {(a.delay, a.time_constant) for a in rig.actuators}:
         group = [j for j, a in enumerate(rig.actuators) if (a.delay, a.time_constant) == (delay, lag)]
         forces = np.array([actuator_force(rig.actuators[j], inputs[j]) for j in group])
@@ -170,12 +170,7 @@ def _steps_within(
 ) -> tuple[Step, ...]:
     """Steps of the modal forces within each sample interval, of held inputs that are delayed or lagged.
 
-    Args:
-        rig: has the actuators.
-        inputs: (n_actuators, n_samples) commands with cross-talk.
-        acting: (n_actuators, n_samples) forces at the samples, without bias.
-        participation: (n_modes, n_actuators or more).
-        sample_time: s.
+    `inputs` are commands with cross-talk, `acting` the forces at the samples without bias, (n_actuators, n_samples).
     """
     steps: dict[tuple[float, float], Floats] = {}
     for j, actuator in enumerate(rig.actuators):
@@ -242,12 +237,9 @@ def prediction_errors(
 
     Args:
         rig: its sensors may have gain, bias and drift; lag, clipping and rounding are not included.
-        inputs: (n_actuators, n_samples) commands.
-        outputs: (n_sensors, n_samples) measured.
+        inputs, outputs: commands (n_actuators, n_samples) and measured readings (n_sensors, n_samples).
         gain: (2, n_modes, n_sensors) of the observer, from innovations to displacements and velocities of the modes.
-        sample_time: s.
-        substeps: per sample interval.
-        input_hold: as of `simulate`.
+        sample_time, substeps, input_hold: as of `simulate`.
     """
     participation, at_samples, forces = _forces(rig, inputs, sample_time, substeps, input_hold)
     reading, orders = reading_of(rig)
@@ -267,18 +259,13 @@ def prediction_errors(
 def _forces(
     rig: Rig, inputs: Floats, sample_time: float, substeps: int, input_hold: str
 ) -> tuple[Floats, Floats, Forces]:
-    """Forces of actuators and sinusoids.
-
-    Returns:
-        Participation (n_modes, n_forces), the forces at the samples (n_forces, n_samples), and for
-        `step_record` those that are ever other than zero.
-    """
-    modes, h = rig.modes, sample_time / substeps
-    drive, participation = drives(inputs, substeps, rig.actuators, sample_time, input_hold), participation_of(rig)
-    driven, starts, ends, at_samples, courses, sizes = drive
+    """Participation (n_modes, n_forces) of actuators and sinusoids, their forces at samples and for `step_record`."""
+    modes, h, participation = rig.modes, sample_time / substeps, participation_of(rig)
+    drive = drives(inputs, substeps, rig.actuators, sample_time, input_hold)
+    driven, starts, ends, at_samples, waveforms, sizes = drive
     damping = np.diag(modes.damping).copy()
-    corrections = {c: motion_correction(c, modes.omega, damping, h) for c in {course for _, course in courses}}
-    added = [corrections[course] * participation[:, j] for j, course in courses]
+    corrections = {c: motion_correction(c, modes.omega, damping, h) for c in {waveform for _, waveform in waveforms}}
+    added = [corrections[waveform] * participation[:, j] for j, waveform in waveforms]
     for element in rig.elements:
         if isinstance(element, PeriodicForce):
             start, end, now = sinusoid_on_substeps(element, inputs.shape[1], sample_time, substeps)

@@ -8,8 +8,8 @@ import numpy as np
 
 from workbench.arrays import Floats
 from workbench.rig.actuators import Actuator, mixing
-from workbench.rig.rig import Transducer, shape_of
-from workbench.rig.sensors import MEASURED, Sensor
+from workbench.rig.rig import Transducer, shape_of, transducer_text
+from workbench.rig.sensors import MEASURED, Sensor, crosstalk_between
 from workbench.structure.modes import Modes
 from workbench.structure.printed import joined_in_words
 
@@ -28,8 +28,7 @@ DELAY_ORDER = 0.7  # order of a delay line per radian of the fastest mode within
 def input_matrix(modes: Modes, actuators: Sequence[Actuator]) -> np.ndarray:
     """Modal forces per unit command (n_modes, n_actuators): gain times φ_r at the place, or its slope for a moment.
 
-    Raises:
-        ValueError: an actuator on a support, where it does no work, or with cross-talk, which no design includes.
+    An actuator on a support, where it does no work, or with cross-talk, which no design includes, is refused.
     """
     leaking = next((actuator for actuator in actuators if actuator.crosstalk), None)
     if leaking is not None:
@@ -72,41 +71,22 @@ def state_space(modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[S
             cross-talk from a sensor or an actuator that is not among these.
     """
     parts: tuple[Transducer, ...] = (*actuators, *sensors)
-    for part in parts:
-        _check_finite_linear(part)
-    a, b, c, d, states = modal_plant(modes, actuators, sensors, with_crosstalk=True)
-    return control.ss(
-        a,
-        b,
-        c[: len(sensors)],
-        d[: len(sensors)],
-        inputs=signal_names(x.name for x in actuators),
-        outputs=signal_names(y.name for y in sensors),
-        states=signal_names(states),
-        name="rig",
-    )
-
-
-def _check_finite_linear(part: Transducer) -> None:
-    """Refuse an actuator or a sensor that no finite `StateSpace` represents.
-
-    Raises:
-        ValueError: with what it has, and the remedy.
-    """
-    if part.has_state_space:
-        return
-    channel = f"{'actuator' if isinstance(part, Actuator) else 'sensor'} {part.name}"
-    ideal = replace(part, delay=0.0)
-    if ideal.has_state_space:
+    for part in (part for part in parts if not part.has_state_space):
+        channel = transducer_text(part)
+        if replace(part, delay=0.0).has_state_space:
+            raise ValueError(
+                f"{channel} has a delay, which no finite StateSpace represents exactly; leave it out and connect an"
+                " approximation by control.pade in series, or simulate the rig"
+            )
+        nonlinear = [what for name, what in NONLINEAR.items() if getattr(part, name, 0.0) not in (0.0, np.inf)]
         raise ValueError(
-            f"{channel} has a delay, which no finite StateSpace represents exactly; leave it out and connect an"
-            " approximation by control.pade in series, or simulate the rig"
+            f"{channel} has {joined_in_words(nonlinear)}, so it is not linear and the rig has no StateSpace; simulate"
+            " it instead"
         )
-    nonlinear = [what for name, what in NONLINEAR.items() if getattr(part, name, 0.0) not in (0.0, np.inf)]
-    raise ValueError(
-        f"{channel} has {joined_in_words(nonlinear)}, so it is not linear and the rig has no StateSpace; simulate it"
-        " instead"
-    )
+    a, b, c, d, states = modal_plant(modes, actuators, sensors, with_crosstalk=True)
+    n = len(sensors)
+    names = {"inputs": signal_names(x.name for x in actuators), "outputs": signal_names(y.name for y in sensors)}
+    return control.ss(a, b, c[:n], d[:n], states=signal_names(states), name="rig", **names)
 
 
 def modal_plant(
@@ -115,11 +95,8 @@ def modal_plant(
     """A, B, C, D and the names of the states, from commands to readings and to the delayed and lagged commands.
 
     Lags and delays are included, a delay as of `delay_line`; nonlinear imperfections are not, and cross-talk where it
-    is asked for. The last n_actuators rows of C and D give the delayed and lagged commands, before the gains.
-
-    Raises:
-        ValueError: cross-talk from a sensor or an actuator that is not among these; cross-talk of actuators, where
-            none is asked for.
+    is asked for: without, that of an actuator raises a `ValueError`. The last n_actuators rows of C and D give the
+    delayed and lagged commands, before the gains.
     """
     n, m = modes.n_modes, len(actuators)
     force = _input_matrix(modes, actuators) if with_crosstalk else input_matrix(modes, actuators)
@@ -138,47 +115,29 @@ def modal_plant(
 
     c, d = read(sensors)
     if with_crosstalk and any(sensor.crosstalk for sensor in sensors):
-        share = _shares(sensors)
+        share = np.zeros((len(sensors), len(sensors)))
+        for j, i, taken in crosstalk_between(sensors):
+            share[j, i] += sensors[j].gain * taken
         more = read([replace(sensor, gain=1.0) for sensor in sensors])
         c, d = c + share @ more[0], d + share @ more[1]
     c, d = np.vstack([c, np.zeros((m, 2 * n))]), np.vstack([d, np.eye(m)])
     states = [f"q{r + 1}" for r in range(n)] + [f"dq{r + 1}" for r in range(n)]
-    for j, actuator in enumerate(actuators):
-        for what, (pa, pb, pc) in lateness(actuator, modes):
+    transducers: list[tuple[int, Transducer]] = [*enumerate(actuators), *enumerate(sensors)]
+    for j, part in transducers:
+        for what, (pa, pb, pc) in lateness(part, modes):
             size = len(pa)
-            a = np.block([[a, b[:, [j]] * pc], [np.zeros((size, len(a))), pa]])
-            b, c = np.vstack([b, np.zeros((size, m))]), np.hstack([c, d[:, [j]] * pc])
-            b[:, j], d[:, j] = np.r_[np.zeros(len(a) - size), pb], 0.0
-            states += _named(f"{actuator.name}_{what}", size)
-    for j, sensor in enumerate(sensors):
-        for what, (pa, pb, pc) in lateness(sensor, modes):
-            size = len(pa)
-            a = np.block([[a, np.zeros((len(a), size))], [np.outer(pb, c[j]), pa]])
-            b, c = np.vstack([b, np.outer(pb, d[j])]), np.hstack([c, np.zeros((len(c), size))])
-            c[j], d[j] = np.r_[np.zeros(len(a) - size), pc], 0.0
-            states += _named(f"{sensor.name}_{what}", size)
+            if isinstance(part, Actuator):
+                a = np.block([[a, b[:, [j]] * pc], [np.zeros((size, len(a))), pa]])
+                b, c = np.vstack([b, np.zeros((size, m))]), np.hstack([c, d[:, [j]] * pc])
+                b[:, j], d[:, j] = np.r_[np.zeros(len(a) - size), pb], 0.0
+            else:
+                a = np.block([[a, np.zeros((len(a), size))], [np.outer(pb, c[j]), pa]])
+                b, c = np.vstack([b, np.outer(pb, d[j])]), np.hstack([c, np.zeros((len(c), size))])
+                c[j], d[j] = np.r_[np.zeros(len(a) - size), pc], 0.0
+            states += [f"{part.name}_{what}{i + 1 if size > 1 else ''}" for i in range(size)]
     if any(actuator.crosstalk for actuator in actuators):
         b, d = b @ mixing(actuators), d @ mixing(actuators)
     return a, b, c, d, states
-
-
-def _shares(sensors: Sequence[Sensor]) -> Floats:
-    """Cross-talk as a matrix (n_sensors, n_sensors): the reading of each sensor per quantity that another measures.
-
-    Raises:
-        ValueError: a share of a sensor that is not among these.
-    """
-    names, shares = [sensor.name for sensor in sensors], np.zeros((len(sensors), len(sensors)))
-    for j, sensor in enumerate(sensors):
-        for name, share in sensor.crosstalk:
-            if name not in names:
-                raise ValueError(f"sensor {sensor.name} reads a share of {name!r}, which is no sensor of the rig")
-            shares[j, names.index(name)] += sensor.gain * share
-    return shares
-
-
-def _named(name: str, size: int) -> list[str]:
-    return [name] if size == 1 else [f"{name}{i + 1}" for i in range(size)]
 
 
 Late = tuple[Floats, Floats, Floats]

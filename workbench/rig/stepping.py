@@ -37,7 +37,7 @@ Along = tuple[float, Floats, Floats, Floats, Floats, Floats]
 Moving = tuple[Floats, Floats, Floats]
 Points = tuple[Floats, Floats, Floats, Floats]
 Work = tuple[Floats, Floats, Floats, Floats, Floats, Floats]
-Kept = tuple[Floats, Floats, Floats, Floats]
+Kept = tuple[Points, Points, Floats, Drives]
 
 
 @lru_cache(maxsize=KEPT)
@@ -99,18 +99,12 @@ def law_arrays(rig: Rig) -> Elements:
 
 
 @njit(cache=True, nogil=True)
-def spread_forces(
-    q: Floats,
-    v: Floats,
-    stretch: float,
-    stretching: Floats,
-    drag_shapes: Floats,
-    drag_weights: Floats,
-    push: Floats,
-    coupling: Floats,
-    out: Floats,
-) -> None:
-    """Fill the modal forces (n_modes,) of stretching, drag and damping that couples modes; push is a work array."""
+def distributed_forces(q: Floats, v: Floats, along: Along, out: Floats) -> None:
+    """Fill the modal forces (n_modes,) of stretching, drag and damping that couples modes.
+
+    `along` holds their arrays, see `structure_arrays`, with a work array (n_points,) before the coupling.
+    """
+    stretch, stretching, drag_shapes, drag_weights, push, coupling = along
     n = q.size
     out[:] = 0.0
     if stretch != 0.0:
@@ -184,7 +178,7 @@ def _advance_once(
     e, aw, av = linear
     drive, drive_end, more_q, more_v = drives
     kinds, shapes, parameters = elements
-    stretch, stretching, drag_shapes, drag_weights, push, coupling = along
+    stretch, _, _, drag_weights, _, coupling = along
     q, v, old = motion
     point, earlier, w_old, z = points
     w_free, v_free, base_q, base_v, new, spread = work
@@ -209,7 +203,7 @@ def _advance_once(
         for i in range(n_elements):
             w_free[i], v_free[i] = row_times(shapes, i, q), row_times(shapes, i, v)
         if n_elements > 0:
-            solve_laws(kinds, parameters, w_free, v_free, aw, av, z, w_old, point)
+            solve_laws((kinds, parameters), w_free, v_free, aw, av, z, w_old, point)
         for r in range(n):
             new[r] = spread[r]
         for i in range(n_elements):
@@ -221,7 +215,7 @@ def _advance_once(
             v[r] = base_v[r] + e[1, 3, r] * new[r]
         if distributed and sweep == 0:
             # distributed forces, from the predicted motion
-            spread_forces(q, v, stretch, stretching, drag_shapes, drag_weights, push, coupling, spread)
+            distributed_forces(q, v, along, spread)
     for r in range(n):
         old[r] = new[r]
     for i in range(n_elements):
@@ -231,13 +225,6 @@ def _advance_once(
         if kinds[i] == BOUC_WEN:
             z[i], _ = yield_update(z[i], w - w_old[i], parameters[i, 1])
         w_old[i] = w
-
-
-@njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
-def _fill_rates(shapes: Floats, v: Floats, rates: Floats, row: int) -> None:
-    """Fill a row of `rates` with the velocities at the elements."""
-    for i in range(shapes.shape[0]):
-        rates[row, i] = row_times(shapes, i, v)
 
 
 @njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
@@ -252,17 +239,12 @@ def _friction_reverses(kinds: Integers, parameters: Floats, rates: Floats) -> bo
 
 
 @njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
-def _keep(kept: Floats, a: Floats, b: Floats, c: Floats, d: Floats) -> None:
-    """Copy four arrays (n,) into `kept` (4, n)."""
+def _copy(arrays: Points, into: Points) -> None:
+    """Copy four arrays of one length into four others."""
+    a, b, c, d = arrays
+    e, f, g, h = into
     for i in range(a.size):
-        kept[0, i], kept[1, i], kept[2, i], kept[3, i] = a[i], b[i], c[i], d[i]
-
-
-@njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
-def _put_back(kept: Floats, a: Floats, b: Floats, c: Floats, d: Floats) -> None:
-    """Restore four arrays (n,) from `kept` (4, n)."""
-    for i in range(a.size):
-        a[i], b[i], c[i], d[i] = kept[0, i], kept[1, i], kept[2, i], kept[3, i]
+        e[i], f[i], g[i], h[i] = a[i], b[i], c[i], d[i]
 
 
 @njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
@@ -285,7 +267,7 @@ def advance(
         drives: modal forces (n_modes,) at the start and the end of the substep; and corrections of q and q' at the end
             for forces that are not linear.
         elements: kinds (n_elements,), shapes (n_elements, n_modes) and parameters (n_elements, 3) of point elements.
-        along: distributed elements, see `spread_forces`.
+        along: distributed elements, see `distributed_forces`.
         motion: q, q' and the modal forces of all elements, (n_modes,): updated.
         points: forces, previous forces, displacements and hysteretic displacements, (n_elements,): updated.
         work: free displacements and rates (n_elements,); q, q' and forces (n_modes,); distributed forces (n_modes,),
@@ -294,42 +276,35 @@ def advance(
     """
     kinds, shapes, parameters = elements
     start, end, more_q, more_v = drives
-    q, v, old = motion
-    point, earlier, w, z = points
-    spread = work[5]
-    modes_kept, points_kept, rates, parts_of = kept
+    v, moving = motion[1], (motion[0], motion[1], motion[2], work[5])
+    moving_kept, points_kept, rates, of_part = kept
     friction = _has_friction(kinds)
     if friction:
-        _keep(modes_kept, q, v, old, spread)
-        _keep(points_kept, point, earlier, w, z)
-        _fill_rates(shapes, v, rates, 0)
+        _copy(moving, moving_kept)
+        _copy(points, points_kept)
+        for i in range(kinds.size):
+            rates[0, i] = row_times(shapes, i, v)
     parts, part = 1, 0
     while part < parts:
         # one call for both cases, because every inlined call is compiled again
         whole = parts == 1
-        _advance_once(
-            linear if whole else finely,
-            drives if whole else (parts_of[0], parts_of[1], parts_of[2], parts_of[3]),
-            elements,
-            along,
-            motion,
-            points,
-            work,
-        )
+        coefficients, forces = (linear, drives) if whole else (finely, of_part)
+        _advance_once(coefficients, forces, elements, along, motion, points, work)
         part += 1
         if friction and whole:
-            _fill_rates(shapes, v, rates, 1)
+            for i in range(kinds.size):
+                rates[1, i] = row_times(shapes, i, v)
             if _friction_reverses(kinds, parameters, rates):
-                _put_back(modes_kept, q, v, old, spread)
-                _put_back(points_kept, point, earlier, w, z)
+                _copy(moving_kept, moving)
+                _copy(points_kept, points)
                 parts, part = PARTS, 0
         if parts > 1:
-            for r in range(q.size):
+            for r in range(v.size):
                 rise = (end[r] - start[r]) / PARTS
-                parts_of[0, r] = start[r] + part * rise
-                parts_of[1, r] = parts_of[0, r] + rise
-                parts_of[2, r] = more_q[r] if part == PARTS - 1 else 0.0
-                parts_of[3, r] = more_v[r] if part == PARTS - 1 else 0.0
+                of_part[0][r] = start[r] + part * rise
+                of_part[1][r] = of_part[0][r] + rise
+                of_part[2][r] = more_q[r] if part == PARTS - 1 else 0.0
+                of_part[3][r] = more_v[r] if part == PARTS - 1 else 0.0
 
 
 @njit(cache=True, nogil=True)
@@ -340,20 +315,17 @@ def at_rest(n: int, n_elements: int) -> tuple[Linear, Linear, Drives, Moving, Po
     motion = np.zeros(n), np.zeros(n), np.zeros(n)
     points = np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements)
     work = np.zeros(n_elements), np.zeros(n_elements), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
-    kept = np.zeros((4, n)), np.zeros((4, n_elements)), np.zeros((2, n_elements)), np.zeros((4, n))
     drives = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    moving = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    of_points = np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements)
+    of_part = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    kept = moving, of_points, np.zeros((2, n_elements)), of_part
     return linear, finely, drives, motion, points, work, kept
 
 
 @njit(cache=True, nogil=True)
 def step_record(
-    structure: Structure,
-    elements: Elements,
-    forces: Forces,
-    dt: float,
-    n_sub: int,
-    observer: Observer,
-    out: Out,
+    structure: Structure, elements: Elements, forces: Forces, dt: float, n_sub: int, observer: Observer, out: Out
 ) -> None:
     """Fill the motion of a rig from rest, or the innovations of an observer, which correct the motion.
 

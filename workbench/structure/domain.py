@@ -46,11 +46,7 @@ class PlaceError(ValueError):
 
 
 def position(place: Location) -> float:
-    """A place as a position along an interval, m.
-
-    Raises:
-        PlaceError: a pair, a name, or two places.
-    """
+    """A place as a position along an interval, m; a pair, a name, or two places raise a `PlaceError`."""
     if isinstance(place, tuple | str):
         raise PlaceError(f"a place along an interval is a position x in m; got {place!r}")
     return float(place)
@@ -85,10 +81,7 @@ class Interval:
         Raises:
             PlaceError: a place outside, or one that is no position.
         """
-        try:
-            x = np.atleast_1d(np.asarray(places, float))
-        except (TypeError, ValueError):
-            x = np.zeros((0, 0))
+        x = np.atleast_1d(_numbers(places))
         if x.ndim != 1:
             raise PlaceError(f"a place along an interval is a position x in m; got {places!r}")
         slack = SLACK * self.length
@@ -159,10 +152,7 @@ class Rectangle:
         Raises:
             PlaceError: a place outside, or one that is no pair.
         """
-        try:
-            xy = np.atleast_2d(np.asarray(places, float))
-        except (TypeError, ValueError):
-            xy = np.zeros((0, 0))
+        xy = np.atleast_2d(_numbers(places))
         if xy.ndim != 2 or xy.shape[1] != 2:
             raise PlaceError(f"a place on a rectangle is a pair (x, y) in m; got {places!r}")
         extent = np.array(self.length)
@@ -421,16 +411,13 @@ class NamedPoints:
                 yield Between(one, other)
 
     def quadrature(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Not available at named points.
-
-        Raises:
-            PlaceError: always.
-        """
+        """Not available at named points: raises a `PlaceError`."""
         raise PlaceError("named points have no shapes between them to integrate; describe the structure as a member")
 
     def separation(self, one: Location, other: Location) -> float:
         """0 for the same place and 1 for another, as named points have no common coordinate."""
-        return float(_unordered(one) != _unordered(other))
+        first, second = (frozenset(place) if isinstance(place, Between) else place for place in (one, other))
+        return float(first != second)
 
     def text(self, place: Location, digits: int = 3) -> str:
         """Text of a place: its name; `digits` is not used."""
@@ -461,25 +448,18 @@ def as_domain(domain: Domain | float) -> Domain:
 
 
 def same_place(place: Any) -> Any:
-    """A place in its hashable form: a float, a pair of floats, a name, `Between` two, or a `Patch`.
-
-    Raises:
-        PlaceError: none of these.
-    """
+    """A place in its hashable form: a float, a pair of floats, a name, `Between` two, or a `Patch`."""
     if isinstance(place, str) or type(place) is float:
         return place
     if isinstance(place, Between):
         return Between(same_place(place.first), same_place(place.second))
     if isinstance(place, Patch):
         return Patch(*map(float, place))
-    try:
-        values = np.asarray(place, float)
-        if values.shape in ((), (1,)):
-            return float(values.reshape(()))
-        if values.shape == (2,):
-            return (float(values[0]), float(values[1]))
-    except (TypeError, ValueError):
-        pass
+    values = _numbers(place)
+    if values.shape in ((), (1,)):
+        return float(values.reshape(()))
+    if values.shape == (2,):
+        return (float(values[0]), float(values[1]))
     raise PlaceError(f"a place is a position x, a pair (x, y), or the name of a point; got {place!r}")
 
 
@@ -504,11 +484,7 @@ def listed(places: np.ndarray) -> list[Place]:
 
 
 def middle(where: Location) -> Place:
-    """The middle of a patch or of the interval between two positions; a single place itself.
-
-    Raises:
-        PlaceError: `Between` two places that are no positions along an interval.
-    """
+    """The middle of a patch or of the interval between two positions along an interval; a single place itself."""
     if isinstance(where, Patch):
         return (where.x, where.y)
     if isinstance(where, Between):
@@ -537,13 +513,17 @@ def reach(domain: Interval | Rectangle, where: Location) -> tuple[np.ndarray, np
     return half, np.atleast_1d(domain.length) - half
 
 
+def _numbers(places: Any) -> Floats:
+    """Places as an array of numbers; an empty array of three axes where they are none."""
+    try:
+        return np.asarray(places, float)
+    except (TypeError, ValueError):
+        return np.zeros((0, 0, 0))
+
+
 def _rounded(value: float, digits: int) -> str:
     """Text of a value to a number of digits, without an exponent: 1341, not 1.34e+03."""
     return f"{value:.{max(digits, len(f'{abs(value):.0f}'))}g}"
-
-
-def _unordered(place: Location) -> Any:
-    return frozenset(place) if isinstance(place, Between) else place
 
 
 def _as_list(names: Any) -> list[Any]:
@@ -561,7 +541,4 @@ def gauss_between(nodes: np.ndarray, n: int) -> tuple[Floats, Floats]:
     return (nodes[:-1, None] + halves * (points + 1.0)).ravel(), (halves * weights).ravel()
 
 
-@cache
-def _gauss(n_points: int) -> tuple[np.ndarray, np.ndarray]:
-    points, weights = np.polynomial.legendre.leggauss(n_points)
-    return points, weights
+_gauss = cache(np.polynomial.legendre.leggauss)

@@ -19,7 +19,6 @@ from workbench.structure.printed import Printed
 from workbench.structure.profile import Profile, ProfileLike, as_profile
 from workbench.structure.supports import (
     HELD,
-    NAMED_ENDS,
     Attachment,
     End,
     PointDamper,
@@ -27,6 +26,7 @@ from workbench.structure.supports import (
     PointSpring,
     as_end,
     masses_among,
+    support_text,
 )
 from workbench.threads import one_blas_thread
 
@@ -57,6 +57,7 @@ class _Member(Printed):
 
     stiffness_name: ClassVar[str]
     strain_order: ClassVar[int]
+    _ends: ClassVar[tuple[str, ...]]  # names of possible ends
 
     @property
     def stiffness(self) -> Profile:
@@ -75,14 +76,14 @@ class _Member(Printed):
             (f"{name.replace('_', ' ')} [{PROFILE_UNITS[name]}]", *(f"{v:.4g}" for v in profile(at)))
             for name, profile in profiles.items()
         ]
-        ends = f"left {_end_text(self.left)}, right {_end_text(self.right)}"
+        ends = f"left {support_text(self.left, self._ends)}, right {support_text(self.right, self._ends)}"
         line = f"{type(self).__name__.lower()}, {self.length:g} m, {ends}"
         return line, ("", *(f"x = {x:.4g} m" for x in at)), rows, tuple(map(str, self.attachments))
 
-    def _prepare(self, allowed_ends: tuple[str, ...]) -> None:
+    def __post_init__(self) -> None:
         Interval(self.length)  # refuses a length that is not positive
-        object.__setattr__(self, "left", as_end(self.left, allowed=allowed_ends))
-        object.__setattr__(self, "right", as_end(self.right, allowed=allowed_ends))
+        object.__setattr__(self, "left", as_end(self.left, allowed=self._ends))
+        object.__setattr__(self, "right", as_end(self.right, allowed=self._ends))
         object.__setattr__(self, "attachments", tuple(self.attachments))
         for name in ("mass_per_length", self.stiffness_name):
             profile = as_profile(getattr(self, name))
@@ -231,15 +232,19 @@ class _Member(Printed):
         coefficients *= self._signs(segments, coefficients)
         return omega, coefficients, tuple(essential)
 
-    def point_masses(self, segments: Segments) -> list[tuple[float, np.ndarray]]:
-        """Attached masses and rotary inertias with the rows of their motions."""
+    def _attached(self, segments: Segments, kind: type[Attachment]) -> list[tuple[float, np.ndarray]]:
+        """The coefficients of attachments of a kind that are not zero, with the rows of their motions."""
         return [
             (value, self._motion_at(segments, position(part.at), derivative))
             for part in self.attachments
-            if isinstance(part, PointMass)
+            if isinstance(part, kind)
             for derivative, value in enumerate(part.pair)
             if value
         ]
+
+    def point_masses(self, segments: Segments) -> list[tuple[float, np.ndarray]]:
+        """Attached masses and rotary inertias with the rows of their motions."""
+        return self._attached(segments, PointMass)
 
     def restraints(
         self, segments: Segments
@@ -256,11 +261,7 @@ class _Member(Printed):
                     essential.append((at, derivative))
                 elif spring:
                     springs.append((spring, segments.evaluation(at, derivative)))
-        for part in self.attachments:
-            if isinstance(part, PointSpring):
-                for derivative, value in enumerate(part.pair):
-                    springs.append((value, self._motion_at(segments, position(part.at), derivative)))
-        return held, essential, springs
+        return held, essential, springs + self._attached(segments, PointSpring)
 
     def _signs(self, segments: Segments, coefficients: np.ndarray) -> np.ndarray:
         """Signs (n_modes,) that make the first derivative that does not vanish at the left end positive."""
@@ -280,12 +281,9 @@ class _Member(Printed):
             matrix: Floats = coefficients.T @ segments.assemble(profile, 0) @ coefficients
         else:
             matrix = self.damping.matrix(omega)
-        for part in self.attachments:
-            if isinstance(part, PointDamper):
-                for derivative, value in enumerate(part.pair):
-                    if value:
-                        row = self._motion_at(segments, position(part.at), derivative) @ coefficients
-                        matrix = matrix + value * row.T @ row
+        for value, row in self._attached(segments, PointDamper):
+            shapes = row @ coefficients
+            matrix = matrix + value * shapes.T @ shapes
         return matrix
 
 
@@ -316,12 +314,6 @@ def segment_ends(breaks: Iterable[float], length: float, slack: float = NO_SLIVE
         if b - nodes[-1] > slack:
             nodes.append(b)
     return np.array(nodes)
-
-
-def _end_text(end: End) -> str:
-    """Text of an end: its name, or its stiffnesses."""
-    names = {(known.translation, known.rotation): name for name, known in NAMED_ENDS.items() if name != "fixed"}
-    return names.get((end.translation, end.rotation), f"on springs of {end.translation:g} N/m and {end.rotation:g} N m")
 
 
 def _degree_for(half_waves: float) -> int:
@@ -359,6 +351,7 @@ class Bar(_Member):
     axial_stiffness: Profile
     stiffness_name = "axial_stiffness"
     strain_order = 1
+    _ends = ("fixed", "free")
 
     if TYPE_CHECKING:  # the arguments may have short forms, which become `Profile` and `End`
 
@@ -376,7 +369,7 @@ class Bar(_Member):
         ) -> None: ...
 
     def __post_init__(self) -> None:
-        self._prepare(("fixed", "free"))
+        super().__post_init__()
         for part in self.attachments:
             if part.pair[1]:
                 raise ValueError(f"{part}: a bar in axial vibration does not rotate; leave {fields(part)[-1].name} out")
@@ -418,6 +411,7 @@ class Beam(_Member):
     tension: float = 0.0
     stiffness_name = "bending_stiffness"
     strain_order = 2
+    _ends = ("hinged", "clamped", "free", "sliding")
 
     if TYPE_CHECKING:  # the arguments may have short forms, which become `Profile` and `End`
 
@@ -434,9 +428,6 @@ class Beam(_Member):
             tension: float = 0.0,
             frequency_errors: Sequence[float] = (),
         ) -> None: ...
-
-    def __post_init__(self) -> None:
-        self._prepare(("hinged", "clamped", "free", "sliding"))
 
     def modes(self, n_modes: int, *, tolerance: float = 1e-10) -> Modes:
         """The lowest `n_modes` modes, mass-normalised, resolved to `tolerance` in their highest derivative."""

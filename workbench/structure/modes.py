@@ -52,9 +52,7 @@ def freeze(owner: object, *names: str, dtype: type | None = float) -> None:
 def modal_state_matrix(stiffness: ArrayLike, damping: ArrayLike) -> np.ndarray:
     """A = [0 I; -S -C] of q'' + C q' + S q = f, states (q_1..q_n, q_1'..q_n'): (2 n_modes, 2 n_modes), rad/s.
 
-    Args:
-        stiffness: S, (n_modes,) the diagonal ω_r², or (n_modes, n_modes), 1/s².
-        damping: C, (n_modes,) the diagonal, or (n_modes, n_modes), 1/s.
+    S (1/s²) and C (1/s) are matrices (n_modes, n_modes), or their diagonals.
     """
     s, c = (np.diag(m) if np.ndim(m) == 1 else np.asarray(m) for m in (stiffness, damping))
     return np.block([[np.zeros(s.shape), np.eye(len(s))], [-s, -c]])
@@ -110,10 +108,8 @@ class Modes(Printed):
                 f" {omega.size}; got shape {damping.shape}"
             )
         object.__setattr__(self, "damping", frozen(damping))
-        if self.covariance is not None:
-            freeze(self, "covariance")
+        freeze(self, *(name for name in ("covariance", "shape_covariance") if getattr(self, name) is not None))
         if self.shape_covariance is not None:
-            freeze(self, "shape_covariance")
             n_points = len(self.domain.names) if isinstance(self.domain, NamedPoints) else 0
             if self.shape_covariance.shape != (omega.size, n_points, n_points):
                 raise ValueError(
@@ -250,17 +246,13 @@ class Modes(Printed):
         index = _indices(modes, self.n_modes)
         if index.size == 0 or index.min() < 0 or index.max() >= self.n_modes:
             raise ValueError(f"modes {index.tolist()} are not all among the {self.n_modes} modes at hand (from 0)")
-        shapes = self.shapes
-        covariance = self.covariance
-        if covariance is not None:
-            both = np.r_[index, index + self.n_modes]
-            covariance = covariance[np.ix_(both, both)]
+        shapes, both = self.shapes, np.r_[index, index + self.n_modes]
         return replace(
             self,
             omega=self.omega[index],
             damping=self.damping[np.ix_(index, index)],
             shapes=lambda located, derivative: shapes(located, derivative)[:, index],
-            covariance=covariance,
+            covariance=None if self.covariance is None else self.covariance[np.ix_(both, both)],
             shape_covariance=None if self.shape_covariance is None else self.shape_covariance[index],
         )
 
@@ -269,11 +261,7 @@ Modes.__init__ = former_arguments(length="domain")(Modes.__init__)  # type: igno
 
 
 class PointShapes:
-    """Shapes known at named points only: one row per point, one column per mode.
-
-    Attributes:
-        values: (n_points, n_modes), mass-normalised, in the order of the points.
-    """
+    """Shapes known at named points only: `values` (n_points, n_modes), mass-normalised, in the order of the points."""
 
     def __init__(self, values: ArrayLike) -> None:
         self.values: Floats = frozen(np.atleast_2d(values))

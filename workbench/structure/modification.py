@@ -151,11 +151,7 @@ def _shapes_at(modes: Modes, part: Attachment, derivative: int) -> np.ndarray:
 
 
 def _combined(
-    modes: Modes,
-    vectors: np.ndarray,
-    omega: np.ndarray,
-    damping: np.ndarray,
-    attachments: tuple[Attachment, ...] = (),
+    modes: Modes, vectors: np.ndarray, omega: np.ndarray, damping: np.ndarray, attachments: tuple[Attachment, ...] = ()
 ) -> Modes:
     """Modes whose shapes are combinations `vectors` (n_modes, n_combined) of the given ones."""
     shapes = modes.shapes

@@ -13,7 +13,6 @@ from workbench.structure.printed import Printed
 from workbench.structure.profile import Field, FieldLike, as_field
 from workbench.structure.supports import (
     HELD,
-    NAMED_EDGES,
     SIDES,
     Attachment,
     Edge,
@@ -22,6 +21,7 @@ from workbench.structure.supports import (
     PointSpring,
     as_edges,
     masses_among,
+    support_text,
 )
 from workbench.structure.surface_basis import EdgeSpring, PointTerm, Square, SurfaceProblem
 from workbench.structure.surface_ritz import solve
@@ -38,7 +38,7 @@ class _Surface(Printed):
     edges: Mapping[str, Edge] = field(default_factory=dict)
     damping: Damping = field(default_factory=ModalDamping)
 
-    _held: ClassVar[str]  # name of an edge without displacement
+    _edges: ClassVar[tuple[str, ...]]  # names of possible edges
 
     @property
     def domain(self) -> Rectangle:
@@ -52,16 +52,17 @@ class _Surface(Printed):
             (f"{name.replace('_', ' ')} [{FIELD_UNITS[name]}]", *(f"{v:.4g}" for v in quantity(*sides.T)))
             for name, quantity in quantities.items()
         ]
-        edges = {side: _edge_text(edge, self._held) for side, edge in self.edges.items()}
+        edges = {side: support_text(edge, self._edges) for side, edge in self.edges.items()}
         alike = len(set(edges.values())) == 1
         around = f"all edges {edges['left']}" if alike else ", ".join(f"{side} {edge}" for side, edge in edges.items())
         line = f"{type(self).__name__.lower()}, {self.length[0]:g} by {self.length[1]:g} m, {around}"
         headings = ("", *(f"at {x:.4g}, {y:.4g} m" for x, y in sides))
         return line, headings, rows, tuple(map(str, getattr(self, "attachments", ())))
 
-    def _prepare(self, allowed_edges: tuple[str, ...], names: tuple[str, ...]) -> None:
+    def _prepare(self, *names: str) -> None:
+        """Check the length, the edges and the fields of these names."""
         object.__setattr__(self, "length", Rectangle(self.length).length)
-        object.__setattr__(self, "edges", as_edges(self.edges, allowed=allowed_edges))
+        object.__setattr__(self, "edges", as_edges(self.edges, allowed=self._edges))
         share = (np.arange(SAMPLES) + 0.5) / SAMPLES
         x, y = share[:, None] * self.length[0], share[None, :] * self.length[1]
         for name in names:
@@ -125,7 +126,7 @@ class Plate(_Surface):
     attachments: tuple[Attachment, ...] = ()
     tension: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    _held = "simply supported"
+    _edges = ("simply supported", "clamped", "free", "guided")
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         line, *table = super()._printed()
@@ -148,7 +149,7 @@ class Plate(_Surface):
         ) -> None: ...
 
     def __post_init__(self) -> None:
-        self._prepare(("simply supported", "clamped", "free", "guided"), ("mass_per_area", "bending_stiffness"))
+        self._prepare("mass_per_area", "bending_stiffness")
         check_poisson_ratio(self.poisson_ratio)
         tension = np.atleast_1d(np.asarray(self.tension, float))
         if tension.size > 3 or not np.isfinite(tension).all():
@@ -357,7 +358,7 @@ class Membrane(_Surface):
 
     tension: Field
 
-    _held = "fixed"
+    _edges = ("fixed", "free")
 
     if TYPE_CHECKING:
 
@@ -373,7 +374,7 @@ class Membrane(_Surface):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "edges", self.edges or "fixed")
-        self._prepare(("fixed", "free"), ("mass_per_area", "tension"))
+        self._prepare("mass_per_area", "tension")
 
     def modes(self, n_modes: int, *, tolerance: float = 1e-6) -> Modes:
         """The lowest `n_modes` modes, mass-normalised, with frequencies to a relative `tolerance`.
@@ -396,13 +397,6 @@ class Membrane(_Surface):
             scale=self._mean(self.tension) / self._mean(self.mass_per_area) * np.pi**2 / (a * b),
         )
         return self._solved(problem, n_modes, tolerance)
-
-
-def _edge_text(edge: Edge, held: str) -> str:
-    """Text of an edge: its name, `held` where it is without displacement alone, or its stiffnesses."""
-    names = {known: name for name, known in NAMED_EDGES.items() if name not in ("fixed", "simply supported")}
-    names[NAMED_EDGES["fixed"]] = held
-    return names.get(edge, f"on springs of {edge.translation:g} N/m² and {edge.rotation:g} N")
 
 
 def _breaks(*fields: Field) -> tuple[tuple[float, ...], tuple[float, ...]]:

@@ -107,21 +107,15 @@ class Segments:
         return _evaluation(self.nodes.tobytes(), self.degrees, self.continuity, x.tobytes(), derivative)
 
     def tabulated(self, segment: int, derivative: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Gauss points of a segment (m), their weights, and a derivative of its functions there.
+        """Gauss points of a segment (m), their weights, and a derivative (n_points, degree + 1) of its functions there.
 
-        Returns:
-            (n_points,), (n_points,) and (n_points, degree + 1); the rule is exact for squares times a polynomial of
-            the seventh degree.
+        The rule is exact for squares times a polynomial of the seventh degree.
         """
         ends = float(self.nodes[segment]), float(self.nodes[segment + 1])
         return _tabulated(*ends, self.degrees[segment], self.continuity, derivative)
 
     def tables(self, derivatives: Iterable[int]) -> tuple[Floats, Floats, list[Floats]]:
-        """Gauss points of all segments (n_points,), m, their weights, and derivatives of all functions there.
-
-        Returns:
-            (points, weights, tables, each (n_points, n_functions)).
-        """
+        """Gauss points of all segments (n_points,), m, their weights, and derivatives (n_points, n_functions) there."""
         x, weights, found = np.zeros(0), np.zeros(0), []
         for derivative in derivatives:
             parts = [self.tabulated(s, derivative) for s in range(self.n_segments)]

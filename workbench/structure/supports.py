@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -36,19 +37,6 @@ NAMED_ENDS = {
 }
 
 
-def as_end(end: str | End, *, allowed: tuple[str, ...]) -> End:
-    """An `End` from its name, or itself.
-
-    Raises:
-        ValueError: a name that is not allowed for this kind of structure.
-    """
-    if isinstance(end, End):
-        return end
-    if end not in allowed:
-        raise ValueError(f"an end is one of {', '.join(allowed)} or an End(translation, rotation); got {end!r}")
-    return NAMED_ENDS[end]
-
-
 @dataclass(frozen=True)
 class Edge(_Support):
     """An edge of a plate: stiffness against displacement (N/m per m) and rotation about it (N m/rad per m).
@@ -65,27 +53,38 @@ NAMED_EDGES = {
     "fixed": Edge(HELD, 0.0),
 }
 SIDES = ("left", "right", "bottom", "top")
+Support = TypeVar("Support", End, Edge)
+
+
+def as_end(end: str | End, *, allowed: tuple[str, ...]) -> End:
+    """An `End` from its name, or itself; a name that the structure does not have is refused by a `ValueError`."""
+    return end if isinstance(end, End) else _named(end, NAMED_ENDS, allowed, "an end")
 
 
 def as_edges(edges: str | Edge | Mapping[str, str | Edge], *, allowed: tuple[str, ...]) -> dict[str, Edge]:
-    """Left (x = 0), right, bottom (y = 0) and top edge, from one for all four or from a mapping of the four.
-
-    Raises:
-        ValueError: a side that is missing or unknown, or an edge of unknown name.
-    """
+    """Left (x = 0), right, bottom (y = 0) and top edge, from one for all four or from a mapping of the four."""
     each = dict(edges) if isinstance(edges, Mapping) else dict.fromkeys(SIDES, edges)
     if set(each) != set(SIDES):
         got = ", ".join(map(str, each)) or "none"
         raise ValueError(f"edges are given for {', '.join(SIDES)}, or one for all; got {got}")
-    by_side = {}
-    for side in SIDES:
-        edge = each[side]
-        if not isinstance(edge, Edge) and edge not in allowed:
-            raise ValueError(
-                f"the {side} edge is one of {', '.join(allowed)} or an Edge(translation, rotation); got {edge!r}"
-            )
-        by_side[side] = edge if isinstance(edge, Edge) else NAMED_EDGES[edge]
-    return by_side
+    return {
+        side: edge if isinstance(edge := each[side], Edge) else _named(edge, NAMED_EDGES, allowed, f"the {side} edge")
+        for side in SIDES
+    }
+
+
+def _named(name: str, named: Mapping[str, Support], allowed: tuple[str, ...], what: str) -> Support:
+    if name not in allowed:
+        kind = type(named["free"]).__name__
+        raise ValueError(f"{what} is one of {', '.join(allowed)} or an {kind}(translation, rotation); got {name!r}")
+    return named[name]
+
+
+def support_text(support: End | Edge, allowed: tuple[str, ...]) -> str:
+    """Text of an end or an edge: its name among those that the structure has, or its stiffnesses."""
+    named, *units = (NAMED_EDGES, "N/m²", "N") if isinstance(support, Edge) else (NAMED_ENDS, "N/m", "N m")
+    springs = f"on springs of {support.translation:g} {units[0]} and {support.rotation:g} {units[1]}"
+    return next((name for name in allowed if named[name] == support), springs)
 
 
 @dataclass(frozen=True)

@@ -22,12 +22,7 @@ THINNEST = 8e-4  # least segment over the side; bending is lost in round-off bel
 
 @dataclass(frozen=True)
 class Square:
-    """One term ½ ∫ weight (Σ coefficient ∂_x^dx ∂_y^dy w)² dA of the strain energy.
-
-    Attributes:
-        weight: function of (x, y).
-        parts: (coefficient, dx, dy) of each derivative.
-    """
+    """One term ½ ∫ weight (Σ c ∂_x^i ∂_y^j w)² dA of the strain energy, with parts (c, i, j) and weight (x, y)."""
 
     weight: Weight
     parts: tuple[tuple[float, int, int], ...]
@@ -228,11 +223,7 @@ def products(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Energy products of other functions with those of the axes (n, n_others) and with each other (n_others, n_others).
 
-    Args:
-        springs, squares: of the energy.
-        axes: of the polynomial functions.
-        others: functions on other axes, a single one each.
-        grid: of the quadrature, see `common_grid`.
+    Each of `others` holds a single function; `grid` is that of the quadrature, see `common_grid`.
     """
     cross = np.zeros((axes[0].n, axes[1].n, len(others)))
     mutual = np.zeros((len(others), len(others)))
@@ -265,11 +256,7 @@ def axes_of(
 ) -> tuple[Axis, Axis]:
     """Functions that represent n_modes modes; each level has higher degrees and one more layer at a singular place.
 
-    Args:
-        problem: the eigenvalue problem.
-        n_modes: number of modes.
-        level: of refinement.
-        near: a point towards which segments shrink, instead of the singular corners.
+    Segments shrink towards the singular corners, or towards the point `near`.
     """
     along_x, along_y = near or (None, None)
     return _axis(problem, 0, n_modes, level, along_x), _axis(problem, 1, n_modes, level, along_y)

@@ -73,14 +73,8 @@ class SurfaceModes:
 def solve(problem: SurfaceProblem, n_modes: int, *, tolerance: float, beyond: int = 0) -> SurfaceModes:
     """The lowest modes, refined until the frequencies converge to a relative `tolerance`.
 
-    Args:
-        problem: the eigenvalue problem.
-        n_modes: number of modes.
-        tolerance: relative, of the frequencies.
-        beyond: largest number of further modes, computed with the same functions.
-
-    Raises:
-        ValueError: the tolerance is not reached with `MOST_FUNCTIONS` functions (with the error reached), or buckling.
+    Up to `beyond` further modes are computed with the same functions. Buckling, and a tolerance that is not reached
+    with `MOST_FUNCTIONS` functions, raise a `ValueError`.
     """
     before, change, error = np.zeros(0), np.inf, np.inf
     for level in range(20):
@@ -162,8 +156,7 @@ def _ritz(
         raise ValueError(UNSTABLE)
     values = np.where(values < RIGID * problem.scale, 0.0, values)
     order = np.argsort(values, kind="stable")
-    modes = _rotated(SurfaceModes(np.sqrt(values), tuple(parts)), np.eye(n_modes)[:, order])
-    modes = replace(modes, omega=np.sqrt(values[order]))
+    modes = _rotated(SurfaceModes(np.sqrt(values[order]), tuple(parts)), np.eye(n_modes)[:, order])
     modes = _rotated(modes, _uncoupling(modes, problem))
     return _rotated(modes, np.diag(_signs(modes, problem)))
 

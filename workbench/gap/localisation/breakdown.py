@@ -13,7 +13,7 @@ from workbench.gap.localisation.force_reconstruction import ForceReconstruction
 from workbench.gap.prediction.residuals import scale_of
 from workbench.identification.signal.distortion import distortion_of, period_of
 from workbench.records.record import Record
-from workbench.rig.linear import held_response, modal_motion, modal_poles, straight_response
+from workbench.rig.linear import first_order_hold_response, held_response, modal_motion, modal_poles
 from workbench.rig.rig import Rig, participation_of
 
 
@@ -334,6 +334,6 @@ def _regressors(rig: Rig, chosen: Sequence[int], record: Record) -> np.ndarray:
     damping = np.maximum(np.diag(rig.modes.damping)[chosen, None], 1e-3 * omega)
     driven = np.array([row for r in chosen for row in (*alone, *[acting[r]] * len(BREAKDOWN.spread))])
     resonators = modal_poles(omega.ravel(), np.diag(damping.ravel()))
-    response_to = held_response if record.input_hold == "zero" else straight_response
+    response_to = held_response if record.input_hold == "zero" else first_order_hold_response
     response, _ = response_to(resonators, record.inputs, driven, record.sample_time)
     return np.concatenate([record.inputs, *modal_motion(resonators, response)])
