@@ -19,7 +19,7 @@ from scipy.signal import cont2discrete
 from workbench.arguments import number
 from workbench.arrays import Floats
 from workbench.design.estimation.controller import Controller
-from workbench.renamed import Renamed, former_arguments
+from workbench.renamed import Renamed, former_fields
 from workbench.rig.statespace import signal_names
 from workbench.structure.modes import freeze, frozen
 
@@ -60,6 +60,7 @@ class FrictionFeedforward:
     smoothing: np.ndarray
 
 
+@former_fields(**{letter.lower(): letter for letter in "ABCDE"})
 @dataclass(frozen=True, eq=False)
 class DigitalController:
     """A controller that runs once a sample.
@@ -158,11 +159,6 @@ class DigitalController:
         a, b = self.A + self.E @ self.C, (self.B + self.E @ self.D) * self.scale
         names = {"inputs": signal_names(self.sensors), "outputs": signal_names(self.actuators)}
         return control.ss(a, b, self.C, self.D * self.scale, self.sample_time, **names)
-
-
-DigitalController.__init__ = former_arguments(  # type: ignore[method-assign]
-    **{letter.lower(): letter for letter in "ABCDE"}
-)(DigitalController.__init__)
 
 
 def modal_states(modes: Sequence[int]) -> tuple[str, ...]:

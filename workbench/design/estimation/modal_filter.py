@@ -254,33 +254,22 @@ def surface_filter(modes: Modes, places: ArrayLike, mass_per_area: FieldLike) ->
 def filter_on(
     structure: Structure | Plate | Membrane | None, modes: Modes, filtered: Sequence[int], places: ArrayLike
 ) -> ModalFilter:
-    """The displacement filter that fits a structure: along it, over it, or at its named points.
-
-    Args:
-        structure: gives the mass; None at named points.
-        modes: of the structure, all that are known.
-        filtered: indices of the modes to be filtered, from 0.
-        places: of the sensors, in any order.
-
-    Raises:
-        ValueError: no structure where one is needed, or sensors that make no filter.
-    """
-    mass: ProfileLike | FieldLike | None = None
+    """The displacement filter that fits a structure, which may be None at named points: see `filter_of_mass`."""
     if isinstance(structure, Plate | Membrane):
-        mass = structure.mass_per_area
-    elif structure is not None:
-        mass = structure.mass_per_length
-    return filter_of_mass(mass, modes, filtered, places)
+        return filter_of_mass(structure.mass_per_area, modes, filtered, places)
+    return filter_of_mass(None if structure is None else structure.mass_per_length, modes, filtered, places)
 
 
 def filter_of_mass(
     mass: ProfileLike | FieldLike | None, modes: Modes, filtered: Sequence[int], places: ArrayLike
 ) -> ModalFilter:
-    """The filter of `filter_on`, from the distribution of mass instead of the structure.
+    """The displacement filter along a structure, over it, or at its named points.
 
     Args:
         mass: kg/m along a structure, kg/m² over a surface; not needed at named points.
-        modes, filtered, places: as in `filter_on`.
+        modes: of the structure, all that are known.
+        filtered: indices of the modes to be filtered, from 0.
+        places: of the sensors, in any order.
 
     Raises:
         ValueError: no mass where it is needed, or sensors that make no filter.

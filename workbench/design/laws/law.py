@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,7 +14,7 @@ from workbench.rig.sensors import Sensor
 from workbench.rig.statespace import input_matrix
 from workbench.structure.domain import Between, NamedPoints, Patch, Rectangle, reach
 from workbench.structure.modes import Modes, freeze
-from workbench.structure.printed import Printed, place_text
+from workbench.structure.printed import Printed, counted, place_text
 
 SINGULAR = 1e8  # condition number of B above which it counts as singular
 UNMOVED = 1e-9  # of an actuator's largest participation in a mode: below, it does not move the mode
@@ -68,9 +69,8 @@ class Law(Printed):
         return len(self.controlled)
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
-        count, several = len(self.actuators), self.n_controlled > 1
-        line = f"{self.name}, u = -K x: mode{'s' * several} {numbered(self.controlled)} by {count} actuator"
-        line += "s" * (count > 1)
+        line = f"{self.name}, u = -K x: mode{'s' * (self.n_controlled > 1)} {numbered(self.controlled)} by"
+        line += f" {counted(len(self.actuators), 'actuator')}"
         modes = [str(r + 1) for r in self.controlled]
         place = "at" if isinstance(self.actuators[0].at, str) else "position [m]"
         headings = ["actuator", place, *(f"q{r}" for r in modes), *(f"q{r}'" for r in modes)]
@@ -82,11 +82,7 @@ class Law(Printed):
 
 
 def linear(law: object) -> Law:
-    """The law, checked to have a gain K.
-
-    Raises:
-        DesignError: a law without one, as of on-off control.
-    """
+    """The law, checked to have a gain K, which on-off control does not."""
     if not isinstance(law, Law):
         raise DesignError(
             f"a law u = -K x is needed here, from imsc, imsc_poles, coupled_lqr or coupled_poles; got"
@@ -96,28 +92,18 @@ def linear(law: object) -> Law:
 
 
 def positive_definite(value: ArrayLike, size: int, what: str) -> np.ndarray:
-    """A number, a diagonal (size,) or a matrix (size, size) as a matrix.
-
-    Raises:
-        DesignError: a value that is not symmetric and positive definite; the message says what it is, `what`.
-    """
+    """A number, a diagonal (size,) or a matrix (size, size), `what` in words, as a positive definite matrix."""
     given = np.asarray(value, float)
     matrix = given * np.eye(size) if given.ndim == 0 else np.diag(given) if given.ndim == 1 else given
     fits = matrix.shape == (size, size) and np.isfinite(matrix).all()
     if not fits or not np.allclose(matrix, matrix.T) or not (np.linalg.eigvalsh(matrix) > 0).all():
-        several = (
-            f", {size} positive numbers or a symmetric positive definite {size} x {size} matrix" if size > 1 else ""
-        )
+        several = f", {size} positive numbers or a symmetric positive definite {size} x {size} matrix" * (size > 1)
         raise DesignError(f"{what} must be a positive number{several}; got {given}")
     return matrix
 
 
 def controlled_indices(modes: Modes, controlled: int | Sequence[int]) -> tuple[int, ...]:
-    """Zero-based indices from a count of lowest modes or a list.
-
-    Raises:
-        DesignError: modes that are not there, or named twice.
-    """
+    """Zero-based indices from a count of lowest modes or a list, checked to be distinct modes of the structure."""
     if isinstance(controlled, np.integer):
         controlled = int(controlled)
     if isinstance(controlled, int) and not 1 <= controlled <= modes.n_modes:
@@ -141,12 +127,7 @@ def weighed_states(omega: Floats) -> Integers:
 
 
 def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[Actuator]) -> np.ndarray:
-    """B of the controlled modes, (n_controlled, n_actuators), checked to be of full row rank.
-
-    Raises:
-        DesignError: more modes than actuators, a mode that no actuator moves, or a singular B, as of two actuators at
-            one place.
-    """
+    """B of the controlled modes, (n_controlled, n_actuators), checked to be of full row rank."""
     actuators = tuple(actuators)
     if len(controlled) > len(actuators):
         raise DesignError(
@@ -158,14 +139,13 @@ def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[A
     if condition <= SINGULAR:
         return b
     text = modes.domain.text
-    for i, first in enumerate(actuators):
-        for second in actuators[i + 1 :]:
-            alike = (first.quantity, first.direction) == (second.quantity, second.direction)
-            if alike and separation(modes, first, second) <= 1e-6:
-                raise DesignError(
-                    f"actuators {first.name} and {second.name} are both at {text(first.at)}, so B is singular;"
-                    " move one by more than 1e-6 of the length"
-                )
+    for first, second in combinations(actuators, 2):
+        alike = (first.quantity, first.direction) == (second.quantity, second.direction)
+        if alike and separation(modes, first, second) <= 1e-6:
+            raise DesignError(
+                f"actuators {first.name} and {second.name} are both at {text(first.at)}, so B is singular;"
+                " move one by more than 1e-6 of the length"
+            )
     raise DesignError(
         f"B of the controlled modes is singular (condition {condition:.2g}): the actuators at"
         f" {', '.join(text(a.at) for a in actuators)} cannot control modes {[r + 1 for r in controlled]}"
@@ -182,11 +162,7 @@ def separation(modes: Modes, first: Actuator | Sensor, second: Actuator | Sensor
 
 
 def controllable_input(modes: Modes, controlled: Sequence[int], actuators: Sequence[Actuator]) -> np.ndarray:
-    """B of the controlled modes, (n_controlled, n_actuators), where some actuator moves each.
-
-    Raises:
-        DesignError: no actuators, or a mode at whose nodes all of them stand.
-    """
+    """B of the controlled modes, (n_controlled, n_actuators), checked that some actuator moves each."""
     return _inputs(modes, controlled, actuators)[0]
 
 

@@ -25,9 +25,6 @@ def assign(a: np.ndarray, b: np.ndarray, poles: ArrayLike, directions: np.ndarra
         poles: (n,) one of each conjugate pair, rad/s, off the real axis; the r-th replaces that of the r-th mode.
         directions: (n_inputs, n) complex, the input that acts best on each mode.
         names: of the modes, for refusals.
-
-    Raises:
-        DesignError: poles of the wrong number, unstable, real, at another mode's open-loop pole, or not assignable.
     """
     n = a.shape[0] // 2
     poles = np.asarray(poles, complex)
@@ -68,8 +65,7 @@ def _resolvents(a: np.ndarray, poles: np.ndarray, forcing: np.ndarray) -> tuple[
     n = a.shape[0] // 2
     qq, qv, vq, vv = (np.diag(block)[:, None] for block in (a[:n, :n], a[:n, n:], a[n:, :n], a[n:, n:]))
     determinants = (poles - qq) * (poles - vv) - qv * vq
-    uncoupled = all(np.count_nonzero(block - np.diag(np.diag(block))) == 0 for block in (a[n:, n:], a[n:, :n]))
-    if uncoupled:
+    if not any((block - np.diag(np.diag(block))).any() for block in (a[n:, n:], a[n:, :n])):  # uncoupled modes
         upper, lower = forcing[:n], forcing[n:]
         with np.errstate(divide="ignore", invalid="ignore"):
             q = ((poles - vv) * upper + qv * lower) / determinants
