@@ -255,7 +255,7 @@ def _loop_truth(rig: Rig, run: LoopRun, controller: DigitalController, sample_ti
     if not run.bounded:
         return np.full((len(rows), run.commands.shape[1]), np.inf)
     n = rig.modes.n_modes
-    forces = run.into @ run.response.forces
+    forces = run.participation @ run.response.forces
     stiffness = np.asarray(rig.modes.omega[:, None] ** 2, float)
     motion = Motion(run.response.modal[:n], run.response.modal[n:], forces, stiffness, rig.modes.damping, sample_time)
     plain = replace(rig, sensors=tuple(replace(s, limit=np.inf, step=0.0) for s in rig.sensors))

@@ -8,10 +8,11 @@ from typing import TypeVar
 import numpy as np
 
 from workbench.arguments import number, whole
+from workbench.design.estimation.controller import check_readable
 from workbench.design.estimation.digital import DigitalController
 from workbench.design.loop.closed_loop import Response
 from workbench.design.loop.loop_steps import ControllerArrays, loop_record
-from workbench.renamed import Renamed, former_arguments
+from workbench.renamed import Renamed, former_fields
 from workbench.rig.actuators import Actuator, mixing
 from workbench.rig.elements import PeriodicForce, RandomForce
 from workbench.rig.rig import Rig, participation_of, shape_of
@@ -27,6 +28,7 @@ P = TypeVar("P", Actuator, Sensor)
 K = TypeVar("K")
 
 
+@former_fields(ports="exciters")
 @dataclass(frozen=True, eq=False)
 class LoopTest:
     """The excitation of a loop from rest: an impulse, forces held over each sample, or both.
@@ -69,9 +71,6 @@ class LoopTest:
         return self.sample_time * np.arange(self.n_samples)
 
 
-LoopTest.__init__ = former_arguments(ports="exciters")(LoopTest.__init__)  # type: ignore[method-assign]
-
-
 @dataclass(frozen=True, eq=False)
 class LoopRun:
     """The response of a rig under a controller.
@@ -81,23 +80,25 @@ class LoopRun:
         commands: (n_actuators, n_samples).
         elements: (3, n_elements, n_samples) displacement, rate and force of each element at a point.
         bounded: whether the motion stayed finite to the end; the response ends before the sample at which it diverged.
-        into: (n_modes, n_actuators) participation factors, modal forces per force.
+        participation: (n_modes, n_actuators) modal forces per force.
     """
 
     response: Response
     commands: np.ndarray
     elements: np.ndarray
     bounded: bool
-    into: np.ndarray
+    participation: np.ndarray
+
+    into = Renamed("participation")
 
     def __post_init__(self) -> None:
-        freeze(self, "commands", "elements", "into")
+        freeze(self, "commands", "elements", "participation")
 
     @property
     def work(self) -> np.ndarray:
         """W_r = ∫ b_rᵀ F q_r' dt (n_modes,), by the mean force over each sample; exact for forces held over it."""
         n = self.response.modes.n_modes
-        modal = self.into @ self.response.forces[:, :-1]
+        modal = self.participation @ self.response.forces[:, :-1]
         return np.asarray((modal * np.diff(self.response.modal[:n], axis=1)).sum(axis=1))
 
     @property
@@ -127,7 +128,7 @@ def run_loop(
     modes, n = rig.modes, rig.modes.n_modes
     sensors = [named(rig.sensors, name) for name in controller.sensors]
     actuators = driven(rig, controller.actuators)
-    into = participation_of(Rig(modes, tuple(actuators), ()))
+    participation = participation_of(Rig(modes, tuple(actuators), ()))
     rng = None if test.seed is None else np.random.default_rng(test.seed)
     noise = np.zeros((len(sensors), test.n_samples))
     if rng is not None:
@@ -146,7 +147,7 @@ def run_loop(
         laws,
         np.array([_drive(a) for a in actuators]).reshape(-1, 9),
         mixing(actuators) if any(a.crosstalk for a in actuators) else np.zeros((0, 0)),
-        np.ascontiguousarray(into),
+        np.ascontiguousarray(participation),
         np.array([_sense(s, test.n_samples) for s in sensors]).reshape(-1, 7),
         _output_matrices(rig, sensors),
         noise,
@@ -161,7 +162,7 @@ def run_loop(
     q, v, f, u, *elements = out
     time = test.sample_time * np.arange(n_samples, dtype=float)
     response = Response(time, np.vstack([q, v]), f, modes)
-    return LoopRun(response, u, np.array(elements), bool(bounded), into)
+    return LoopRun(response, u, np.array(elements), bool(bounded), participation)
 
 
 def run_loops(rigs: Sequence[Rig], controller: DigitalController, test: LoopTest) -> list[LoopRun]:
@@ -195,9 +196,7 @@ def check_fits(rig: Rig, controller: DigitalController, test: LoopTest) -> None:
             f"the controller has a sample time of {controller.sample_time:g} s and the test of {test.sample_time:g} s;"
             " give both the same"
         )
-    for name in controller.sensors:
-        if MEASURED[named(rig.sensors, name).quantity][1] > 1:
-            raise ValueError(f"sensor {name} reads acceleration; a controller here reads displacement or velocity")
+    check_readable([named(rig.sensors, name) for name in controller.sensors])
 
 
 def named(parts: Sequence[P], name: str) -> P:
@@ -208,8 +207,7 @@ def named(parts: Sequence[P], name: str) -> P:
 def driven(rig: Rig, names: Sequence[str]) -> list[Actuator]:
     """The actuators of a rig that a controller drives; cross-talk from others, which have no command, is left out.
 
-    Raises:
-        ValueError: another actuator takes a share of the command of one of them.
+    Another actuator that takes a share of the command of one of them is refused.
     """
     for actuator in rig.actuators:
         taken = [name for name, _ in actuator.crosstalk if name in names]
@@ -232,8 +230,7 @@ def _drive(a: Actuator) -> list[float]:
 
 def _sense(s: Sensor, n_samples: int) -> list[float]:
     # a negative delay, of a sensor ahead of the inputs' clock, is not causal in a loop
-    drift = s.drift / max(n_samples - 1, 1)
-    return [s.gain, s.bias, drift, max(s.delay, 0.0), s.time_constant, s.limit, s.step]
+    return [s.gain, s.bias, s.drift / (n_samples - 1), max(s.delay, 0.0), s.time_constant, s.limit, s.step]
 
 
 def _output_matrices(rig: Rig, sensors: Sequence[Sensor]) -> np.ndarray:
