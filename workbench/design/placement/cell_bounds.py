@@ -16,13 +16,14 @@ neither bounds as wanted may still be excluded by determinants (`hull_bound.py`)
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
 
 from workbench.arrays import Floats, Integers
 from workbench.design.placement.dual_bound import Tables, dual_bound, expanded
-from workbench.design.placement.hull_bound import HullBound
+from workbench.design.placement.hull_bound import hull_tables, raise_to
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.small_matrices import inverse_of, multiply
 from workbench.design.placement.task import PlacementTask
@@ -133,11 +134,10 @@ class CellBounds:
             np.array(forces if np.isfinite(limits.peak_force) else forces[:, :0], order="C"),
             float(limits.peak_force),
         )
-        self._hull: HullBound | None = None  # it needs a limit of all of B⁻¹
+        self._hull: tuple[Any, ...] = ()  # it needs a limit of all of B⁻¹
         if n > 1 and table.most_fourth is not None:
-            measures = (table.centre, table.half, table.most_fourth)
             whole = roots[regular], inverses[regular], bounded[regular]
-            self._hull = HullBound(task, measures, *whole, limits.condition)
+            self._hull = hull_tables(task, (table.centre, table.half, table.most_fourth), *whole, limits.condition)
 
     def __call__(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Lower bounds of √W_R (inf: no placement meets the limits), √W_R at the centres, and the axes to halve."""
@@ -146,8 +146,8 @@ class CellBounds:
         _bounds(cells, *self._arguments, lower, work, axis)
         for j in reversed(range(cells.shape[1] - 1)):  # halve an interval of two actuators first, to separate them
             axis[cells[:, j] == cells[:, j + 1]] = j
-        if self._hull is not None and self.wanted > 0:
-            self._hull.raise_to(self.wanted, cells, lower)
+        if self._hull and self.wanted > 0:
+            raise_to(self.wanted, cells, *self._hull, lower)
         return lower, work, axis
 
 

@@ -14,8 +14,9 @@ from scipy.optimize import OptimizeResult, minimize
 from workbench.arrays import Floats, Integers
 from workbench.design.laws.law import DesignError, Law, weighed_states
 from workbench.design.loop.peak import largest
-from workbench.design.placement.limits import Limits
-from workbench.design.placement.task import Placement, check_uncoupled
+from workbench.design.placement.limits import BOUNDED, Limits
+from workbench.design.placement.task import Placement, check_residual, check_uncoupled
+from workbench.design.spillover.performance import check_weight
 from workbench.design.spillover.spillover import settled_moments
 from workbench.rig.actuators import Actuator
 from workbench.structure.modes import Modes, modal_state_matrix
@@ -50,12 +51,8 @@ def place_coupled(
     Raises:
         DesignError: fewer actuators than rigid modes controlled, or limits that no random placement meets.
     """
-    if not 1 <= n_controlled < modes.n_modes:
-        raise DesignError(
-            f"{n_controlled} of {modes.n_modes} modes controlled leave no residual mode, so there is no spillover"
-        )
-    if not weight > 0:
-        raise DesignError(f"the control weight R must be positive; got {weight:g}")
+    check_residual(modes, n_controlled)
+    check_weight(weight)
     rigid = int((modes.omega[:n_controlled] == 0).sum())
     if n_actuators < rigid:
         raise DesignError(
@@ -71,11 +68,7 @@ def place_coupled(
         if not allowed or (np.diff(at) < limits.spacing).any():
             return np.inf
         placement = coupled_costs(modes, n_controlled, at, impulse_at=impulse_at, weight=weight)
-        within = (
-            placement.effort <= limits.effort
-            and placement.peak_force <= limits.peak_force
-            and placement.condition <= limits.condition
-        )
+        within = all(getattr(placement, name) <= getattr(limits, name) for name in BOUNDED)
         return float(np.log(placement.residual_work)) if within and placement.residual_work > 0 else np.inf
 
     rng = np.random.default_rng(seed)
@@ -109,9 +102,6 @@ def coupled_costs(
         positions: (n_actuators,) m; any number.
         impulse_at: place of the impulse of 1 N s.
         weight: R of the actuator forces.
-
-    Raises:
-        DesignError: damping that couples the modes.
     """
     positions = np.sort(np.asarray(positions, float))
     n, m = n_controlled, positions.size
@@ -169,9 +159,6 @@ def coupled_batch(
     """W_R and effort (n_placements,) of coupled LQR at many placements (n_placements, n_actuators), m.
 
     Both are infinite where no regulator stabilises.
-
-    Raises:
-        DesignError: damping that couples the modes.
     """
     n, count = n_controlled, len(positions)
     shapes = modes.phi(positions.ravel()).reshape(*positions.shape, modes.n_modes)

@@ -9,7 +9,7 @@ from workbench.arrays import Floats, Integers
 from workbench.design.laws.law import DesignError
 from workbench.design.placement.coupled_placement import coupled_batch, coupled_costs
 from workbench.design.placement.limits import Limits
-from workbench.design.placement.places import free_places
+from workbench.design.placement.places import free_places, least_distances
 from workbench.design.placement.task import Placement
 from workbench.structure.modes import Modes
 from workbench.threads import one_blas_thread
@@ -64,16 +64,12 @@ def scan_coupled(
     ]
     work, effort = (np.concatenate(parts) for parts in zip(*costs))
     at = grid[index]
-    gaps = np.diff(at, axis=1).min(axis=1, initial=np.inf)
+    gaps = least_distances(at)
     allowed = free_places(modes.domain, grid, intervals)[index].all(axis=1) & (gaps >= limits.spacing)
-    best = None
-    for i in np.argsort(np.where(allowed & (effort <= limits.effort), work, np.inf)):
-        if not (allowed[i] and effort[i] <= limits.effort and np.isfinite(work[i])):
-            break
-        placement = coupled_costs(modes, n_controlled, at[i], **settings)
-        if limits.satisfied_by(placement):
-            best = placement
-            break
+    rated = np.where(allowed & (effort <= limits.effort), work, np.inf)
+    by_work = (i for i in np.argsort(rated) if np.isfinite(rated[i]))
+    placements = (coupled_costs(modes, n_controlled, at[i], **settings) for i in by_work)
+    best = next(filter(limits.satisfied_by, placements), None)
     if best is None:
         raise DesignError(f"none of {allowed.sum()} placements on the grid meets the limits; raise them")
     widened = [(low - step / 2, high + step / 2) for low, high in intervals]
@@ -90,9 +86,6 @@ def _least(index: Integers, values: Floats, n_places: int) -> Floats:
     field[tuple(index.T)] = np.where(np.isfinite(values), values, np.nan)
     fall = np.zeros(field.shape)
     for axis in range(field.ndim):
-        change = np.nan_to_num(np.abs(np.diff(field, axis=axis)))
-        edge = [(0, 0)] * field.ndim
-        before, after = edge.copy(), edge.copy()
-        before[axis], after[axis] = (1, 0), (0, 1)
-        fall += 0.5 * np.maximum(np.pad(change, before), np.pad(change, after))
+        change = np.nan_to_num(np.abs(np.diff(field, axis=axis, prepend=np.nan, append=np.nan)))
+        fall += 0.5 * np.maximum(np.delete(change, 0, axis), np.delete(change, -1, axis))
     return np.asarray(values - fall[tuple(index.T)])

@@ -20,6 +20,8 @@ for any Λ, with ‖a‖² = Σ_j max_x ‖a(x_j)‖². Here Λ makes w - Λᵀb
 those used separate the values of (Y, B⁻¹ S^½) at the choices from those within the limits, by the Frank-Wolfe method.
 """
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 
@@ -33,58 +35,42 @@ ROUND_OFF = 1e-6  # of ratios of such determinants
 LINE = 12  # steps of the line search
 
 
-class HullBound:
-    """A test that excludes cells (n_cells, n_actuators) of intervals without a placement better than wanted."""
+def hull_tables(
+    task: PlacementTask,
+    table: tuple[Floats, Floats, Floats],
+    roots: Floats,
+    inverses: Floats,
+    limits: Floats,
+    condition: float,
+) -> tuple[Any, ...]:
+    """The arguments of `raise_to` after the cells, from the shapes on the intervals.
 
-    def __init__(
-        self,
-        task: PlacementTask,
-        measures: tuple[Floats, Floats, Floats],
-        roots: Floats,
-        inverses: Floats,
-        limits: Floats,
-        condition: float,
-    ) -> None:
-        """Tabulate the shapes on the intervals.
-
-        Args:
-            task: of the placement.
-            measures: centre and half-width (n_intervals,), largest fourth derivative (n_intervals, n_modes).
-            roots, inverses, limits: S^½ and S^-½ (n_limits, n, n) and L (n_limits,), inf for that of the condition.
-            condition: limit of the condition of B.
-        """
-        n = task.n_controlled
-        centre, half, most_fourth = measures
-        angles = np.pi * np.array([7, 5, 3, 1]) / 8.0
-        values = np.array([task.shapes(centre + s * half) for s in np.cos(angles)])
-        a = [np.tensordot(np.cos(k * angles), values, 1) * (0.5 if k else 0.25) for k in range(4)]
-        remainder = most_fourth * (half[:, None] ** 4 / 192.0)
-        c = a[0] - a[2], a[1] - 3.0 * a[3], 2.0 * a[2], 4.0 * a[3]  # c_0 + c_1 s + c_2 s² + c_3 s³
-        inner, outer = (c[0] - c[2] / 3.0, c[1] / 3.0 - c[3]), (c[0] + c[2], c[1] + c[3])
-        points = np.stack([p + side * q for p, q in (outer, inner) for side in (-1.0, 1.0)], axis=1)
-        # of the columns of B on each interval: the least norm, and the remainder weighted by each S^-½
-        variation = np.abs(a[1]) + 2.0 * np.abs(a[2]) + np.abs(a[3]) + remainder
-        norms = np.linalg.norm(c[0][:, :n], axis=1) - np.linalg.norm(variation[:, :n], axis=1)
-        errors = remainder[:, :n] @ np.abs(inverses).transpose(0, 2, 1)
-        self._arguments = (
-            points,
-            remainder,
-            np.maximum(norms, 0.0) ** 2,
-            (errors**2).sum(axis=2),
-            np.array(task.roots, order="C"),
-            roots,
-            inverses,
-            limits,
-            float(condition),
-        )
-
-    def raise_to(self, wanted: float, cells: Integers, lower: Floats) -> None:
-        """Raise lower bounds (n_cells,) of √W_R to `wanted` where that is proven, in place."""
-        _raise_to(wanted, cells, *self._arguments, lower)
+    Args:
+        task: of the placement.
+        table: centre and half-width (n_intervals,), largest fourth derivative (n_intervals, n_modes).
+        roots, inverses, limits: S^½ and S^-½ (n_limits, n, n) and L (n_limits,), inf for that of the condition.
+        condition: limit of the condition of B.
+    """
+    centre, half, most_fourth = table
+    n = task.n_controlled
+    angles = np.pi * np.array([7, 5, 3, 1]) / 8.0
+    values = np.array([task.shapes(centre + s * half) for s in np.cos(angles)])
+    a = [np.tensordot(np.cos(k * angles), values, 1) * (0.5 if k else 0.25) for k in range(4)]
+    remainder = most_fourth * (half[:, None] ** 4 / 192.0)
+    c = a[0] - a[2], a[1] - 3.0 * a[3], 2.0 * a[2], 4.0 * a[3]  # c_0 + c_1 s + c_2 s² + c_3 s³
+    inner, outer = (c[0] - c[2] / 3.0, c[1] / 3.0 - c[3]), (c[0] + c[2], c[1] + c[3])
+    points = np.stack([p + side * q for p, q in (outer, inner) for side in (-1.0, 1.0)], axis=1)
+    # of the columns of B on each interval: the least norm, and the remainder weighted by each S^-½
+    variation = np.abs(a[1]) + 2.0 * np.abs(a[2]) + np.abs(a[3]) + remainder
+    norms = np.linalg.norm(c[0][:, :n], axis=1) - np.linalg.norm(variation[:, :n], axis=1)
+    errors = remainder[:, :n] @ np.abs(inverses).transpose(0, 2, 1)
+    squared_norms, squared_errors = np.maximum(norms, 0.0) ** 2, (errors**2).sum(axis=2)
+    transforms = np.array(task.roots, order="C")
+    return points, remainder, squared_norms, squared_errors, transforms, roots, inverses, limits, float(condition)
 
 
 @njit(cache=True, nogil=True)
-def _raise_to(
+def raise_to(
     wanted: float,
     cells: Integers,
     points: Floats,
@@ -98,6 +84,7 @@ def _raise_to(
     condition: float,
     lower: Floats,
 ) -> None:
+    """Raise lower bounds (n_cells,) of √W_R of cells (n_cells, n_actuators) of intervals to `wanted` where proven."""
     n = cells.shape[1]
     for cell in range(len(cells)):
         node = cells[cell]
@@ -329,12 +316,8 @@ def is_excluded(
     """
     n_points, n_modes = points.shape[1:]
     n_residual, n, n_columns = transforms.shape
-    centre, choice, b, middle = (
-        np.empty((n, n_modes)),
-        np.empty((n, n_modes)),
-        np.empty((n, n_points, n)),
-        np.empty((n, 1, n)),
-    )
+    centre, choice = np.empty((n, n_modes)), np.empty((n, n_modes))
+    b, middle = np.empty((n, n_points, n)), np.empty((n, 1, n))
     largest = 0.0
     for j in range(n):
         own = points[node[j]]
@@ -352,12 +335,8 @@ def is_excluded(
     if not _evaluate(centre, transforms, root, 1.0, singular, inverse, y, f):
         return False
     chosen, w = np.zeros(n, np.int64), np.empty((n, n_points, n))
-    weights, constant, at_centre, multiplier = (
-        np.empty((n_residual, n)),
-        np.empty((n, n)),
-        np.empty(n),
-        np.empty((n, n)),
-    )
+    weights, constant = np.empty((n_residual, n)), np.empty((n, n))
+    at_centre, multiplier = np.empty(n), np.empty((n, n))
     _, sign = least_ratio(middle, middle, middle.shape[1], 1.0, -np.inf, singular, chosen)
     for _ in range(STEPS):
         size_y, size_f = np.sqrt(inner(y, y)), np.sqrt(inner(f, f))
@@ -403,9 +382,8 @@ def is_excluded(
         for j in range(n):
             for i in range(n_modes):
                 choice[j, i] = points[node[j], chosen[j], i]
-        if np.isinf(ratio) or not _evaluate(
-            choice, transforms, root, sign * of_choice, singular, ignored, new_y, new_f
-        ):
+        sign_there = sign * of_choice
+        if np.isinf(ratio) or not _evaluate(choice, transforms, root, sign_there, singular, ignored, new_y, new_f):
             return False
         t = _step(y, new_y, f, new_f, least, limit)
         for r in range(n_residual):
