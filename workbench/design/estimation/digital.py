@@ -183,23 +183,16 @@ def sampled(controller: Controller, sample_time: float) -> DigitalController:
     if not isinstance(controller, Controller):
         raise TypeError(
             f"the controller must be a law on an estimator; got {type(controller).__name__}: make one by"
-            " kalman_controller, luenberger_controller or filtered"
+            " kalman_controller, luenberger_controller or filtered; a DigitalController is sampled already,"
+            " write_controller writes it"
         )
     if not 0 < number(sample_time, "sample_time", "s") < np.inf:
         raise ValueError(f"sample_time must be above 0; got {sample_time:g} s")
     a, b = zero_order_hold(controller.A, controller.B, sample_time)
-    return DigitalController(
-        sample_time,
-        tuple(sensor.name for sensor in controller.sensors),
-        tuple(actuator.name for actuator in controller.law.actuators),
-        a,
-        b,
-        controller.C,
-        controller.D,
-        np.zeros(controller.C.T.shape),
-        name=controller.name,
-        states=() if controller.static else modal_states(controller.law.controlled),
-    )
+    names = tuple(s.name for s in controller.sensors), tuple(a.name for a in controller.law.actuators)
+    c, d, e = controller.C, controller.D, np.zeros(controller.C.T.shape)
+    states = () if controller.static else modal_states(controller.law.controlled)
+    return DigitalController(sample_time, *names, a, b, c, d, e, name=controller.name, states=states)
 
 
 def zero_order_hold(a: Floats, b: Floats, span: float) -> tuple[Floats, Floats]:

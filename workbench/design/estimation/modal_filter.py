@@ -71,10 +71,8 @@ class ModalFilter(Printed):
 
     def __call__(self, displacement: ArrayLike, slope: ArrayLike | None = None) -> Floats:
         """Modal coordinates (n_modes, ...) from readings (n_sensors, ...), time last."""
-        modal: Floats = self.displacement @ np.asarray(displacement, float)
-        if slope is not None and self.slope.size:
-            modal = modal + self.slope @ np.asarray(slope, float)
-        return modal
+        modal = np.asarray(self.displacement @ np.asarray(displacement, float))
+        return modal if slope is None or not self.slope.size else modal + self.slope @ np.asarray(slope, float)
 
     seen = Renamed("response_to")
 

@@ -52,9 +52,6 @@ def usual_poles(modes: Modes, controlled: Sequence[int]) -> Complexes:
     """Default poles (n_controlled,) of an observer's estimation error, rad/s: (-0.3 + i) ω of each mode.
 
     Rigid modes have no frequency: ω is then evenly spaced below that of the slowest elastic mode.
-
-    Raises:
-        DesignError: rigid modes alone.
     """
     omega = np.array(modes.omega[list(controlled)])
     rigid, elastic = omega == 0, modes.omega[modes.omega > 0]
@@ -64,8 +61,7 @@ def usual_poles(modes: Modes, controlled: Sequence[int]) -> Complexes:
             " poles, or use kalman_controller"
         )
     omega[rigid] = elastic[:1] * np.arange(1, rigid.sum() + 1) / (rigid.sum() + 1)
-    poles: Complexes = USUAL * omega
-    return poles
+    return np.asarray(USUAL * omega)
 
 
 def kalman_controller(

@@ -39,8 +39,7 @@ class Law(Printed):
 
     Raises:
         TypeError: a controlled mode that is no number.
-        ValueError: a gain of another shape, or that is not finite; no controlled mode, or one that is negative, no
-            whole number, or named twice.
+        ValueError: a gain of another shape or not finite, or controlled modes that are not distinct whole numbers.
     """
 
     gain: np.ndarray
@@ -187,20 +186,18 @@ def _inputs(modes: Modes, controlled: Sequence[int], actuators: Sequence[Actuato
 
 def _largest_participation(modes: Modes, actuator: Actuator) -> Floats:
     """The largest participation of each mode (n_modes,) in an actuator's command, over all places."""
-    moment = actuator.quantity == "moment"
-    if isinstance(modes.domain, NamedPoints):
-        shapes = modes.phi(modes.domain.rotations() if moment else modes.domain.grid())
-    elif isinstance(modes.domain, Rectangle) and isinstance(actuator.at, Patch):
-        low, high = reach(modes.domain, actuator.at)
-        middles = np.clip(modes.domain.grid(PER_SIDE), low, high)
-        sides = np.broadcast_to(actuator.at[2:], middles.shape)
-        shapes = modes.edge_slopes(np.hstack([middles, sides]), direction=actuator.direction)
-    elif isinstance(modes.domain, Rectangle):
-        shapes = modes.phi(modes.domain.grid(PER_SIDE), int(moment), direction=actuator.direction)
+    domain, moment = modes.domain, actuator.quantity == "moment"
+    if isinstance(domain, NamedPoints):
+        shapes = modes.phi(domain.rotations() if moment else domain.grid())
+    elif isinstance(domain, Rectangle) and isinstance(actuator.at, Patch):
+        middles = np.clip(domain.grid(PER_SIDE), *reach(domain, actuator.at))
+        patches = np.hstack([middles, np.broadcast_to(actuator.at[2:], middles.shape)])
+        shapes = modes.edge_slopes(patches, direction=actuator.direction)
+    elif isinstance(domain, Rectangle):
+        shapes = modes.phi(domain.grid(PER_SIDE), int(moment), direction=actuator.direction)
     else:
         shapes = modes.phi(np.linspace(0.0, modes.length, 8 * modes.n_modes + 9), int(moment))
-    most: Floats = abs(actuator.gain) * np.abs(shapes).max(axis=0)
-    return most
+    return np.asarray(abs(actuator.gain) * np.abs(shapes).max(axis=0))
 
 
 def numbered(indices: Sequence[int]) -> str:

@@ -58,13 +58,14 @@ class LoopTest:
             raise ValueError(
                 f"a test needs 2 samples or more, a positive time apart; got {self.n_samples}, {self.sample_time:g} s"
             )
-        if self.forces is not None and np.shape(self.forces) != (len(self.exciters), self.n_samples):
+        if self.forces is None:
+            return
+        if np.shape(self.forces) != (len(self.exciters), self.n_samples):
             raise ValueError(
                 f"LoopTest.forces must have shape ({len(self.exciters)} exciters, {self.n_samples} samples); got"
                 f" {np.shape(self.forces)}. Is time last?"
             )
-        if self.forces is not None:
-            freeze(self, "forces")
+        freeze(self, "forces")
 
     @property
     def time(self) -> np.ndarray:
@@ -181,11 +182,9 @@ def of_loops(
 
 def check_fits(rig: Rig, controller: DigitalController, test: LoopTest) -> None:
     """Refuse a controller that does not fit a rig or a test, or one that reads an accelerometer."""
-    for kind, names, there in (
-        ("sensor", controller.sensors, {s.name for s in rig.sensors}),
-        ("actuator", controller.actuators, {a.name for a in rig.actuators}),
-    ):
-        missing = [name for name in names if name not in there]
+    for kind in ("sensor", "actuator"):
+        there = {part.name for part in getattr(rig, f"{kind}s")}
+        missing = [name for name in getattr(controller, f"{kind}s") if name not in there]
         if missing:
             raise ValueError(
                 f"the controller names {kind} {missing[0]!r}, which the rig does not have: it has"
@@ -269,12 +268,6 @@ def _arrays(one: DigitalController) -> ControllerArrays:
         switching = (relays.allocation, relays.force, relays.dead_band)
     if friction is not None:
         forward = (friction.gain, friction.of_state, friction.of_reading, friction.force, friction.smoothing)
-    return tuple(
-        tuple(np.array(x, float, order="C") for x in group)
-        for group in (
-            (one.A, one.B, one.C, one.D, one.E),
-            (one.offset, one.scale, one.limit, one.rate, one.dead_zone, one.bias),
-            switching,
-            forward,
-        )
-    )
+    matrices, bounds = (one.A, one.B, one.C, one.D, one.E), (one.limit, one.rate, one.dead_zone, one.bias)
+    groups = (matrices, (one.offset, one.scale, *bounds), switching, forward)
+    return tuple(tuple(np.array(x, float, order="C") for x in group) for group in groups)

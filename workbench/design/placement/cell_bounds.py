@@ -16,14 +16,13 @@ neither bounds as wanted may still be excluded by determinants (`hull_bound.py`)
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numba import njit
 
 from workbench.arrays import Floats, Integers
 from workbench.design.placement.dual_bound import Tables, dual_bound, expanded
-from workbench.design.placement.hull_bound import hull_tables, raise_to
+from workbench.design.placement.hull_bound import HullTables, hull_tables, raise_to
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.small_matrices import inverse_of, multiply
 from workbench.design.placement.task import PlacementTask
@@ -134,7 +133,7 @@ class CellBounds:
             np.array(forces if np.isfinite(limits.peak_force) else forces[:, :0], order="C"),
             float(limits.peak_force),
         )
-        self._hull: tuple[Any, ...] = ()  # it needs a limit of all of B⁻¹
+        self._hull: HullTables | None = None  # it needs a limit of all of B⁻¹
         if n > 1 and table.most_fourth is not None:
             whole = roots[regular], inverses[regular], bounded[regular]
             self._hull = hull_tables(task, (table.centre, table.half, table.most_fourth), *whole, limits.condition)
@@ -146,7 +145,7 @@ class CellBounds:
         _bounds(cells, *self._arguments, lower, work, axis)
         for j in reversed(range(cells.shape[1] - 1)):  # halve an interval of two actuators first, to separate them
             axis[cells[:, j] == cells[:, j + 1]] = j
-        if self._hull and self.wanted > 0:
+        if self._hull is not None and self.wanted > 0:
             raise_to(self.wanted, cells, *self._hull, lower)
         return lower, work, axis
 
@@ -204,19 +203,12 @@ def _series_bound(
 ) -> tuple[float, float]:
     """Lower bound of √W_R in a cell and its value at the centre; -inf and inf where Neumann's series may diverge.
 
-    The bound is inf where no placement keeps the limit of the peak force.
-
-    Args:
-        node, h: (n,) intervals and their half-widths.
-        tables: of the shapes on all intervals.
-        transforms: T (n_residual, n, n_columns).
-        forces, peak: f (n, n_instants) and P.
-        score: (n,) set to how much the width of each interval weakens the bound.
+    The bound is inf where no placement keeps the limit P of the peak force under the modal forces f (n, n_instants).
     """
     value = tables[0]
     n_residual, n, n_columns = transforms.shape
     matrix, m, change = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
-    neumann, error, most = np.empty((n, n)), np.empty((n, n)), np.empty(n)
+    neumann, error, most = np.empty((n, n)), np.empty((n, n)), np.ones(n)
     largest = 0.0
     for j in range(n):
         score[j] = h[j]
@@ -227,8 +219,6 @@ def _series_bound(
         return -np.inf, np.inf
 
     # change of the forces over the cell: E = M ΔB
-    for i in range(n):
-        most[i] = 1.0
     for j in range(n):
         score[j] = 0.0
         for i in range(n):

@@ -223,13 +223,9 @@ class _Search:
     def _better(self, cells: Integers, work: Floats) -> Floats | None:
         """Places at the centre of a cell that improve on the placement by more than the gap; None where none do."""
         for i in np.argsort(work)[:TRIED]:
-            if not work[i] < self._wanted:
-                break
-            places = self._tree.places(cells[i])
-            if places is None:
-                continue
-            placement = self._task.placed(places, "")
-            if placement.residual_work < self._wanted**2 and self._limits.satisfied_by(placement):
+            places = self._tree.places(cells[i]) if work[i] < self._wanted else None
+            placement = None if places is None else self._task.placed(places, "")
+            if placement and placement.residual_work < self._wanted**2 and self._limits.satisfied_by(placement):
                 return placement.positions
         return None
 

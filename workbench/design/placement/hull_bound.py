@@ -20,8 +20,6 @@ for any Λ, with ‖a‖² = Σ_j max_x ‖a(x_j)‖². Here Λ makes w - Λᵀb
 those used separate the values of (Y, B⁻¹ S^½) at the choices from those within the limits, by the Frank-Wolfe method.
 """
 
-from typing import Any
-
 import numpy as np
 from numba import njit
 
@@ -34,6 +32,8 @@ SINGULAR = 1e-9  # least pivot over the largest entry of B for reliable determin
 ROUND_OFF = 1e-6  # of ratios of such determinants
 LINE = 12  # steps of the line search
 
+HullTables = tuple[Floats, Floats, Floats, Floats, Floats, Floats, Floats, Floats, float]
+
 
 def hull_tables(
     task: PlacementTask,
@@ -42,7 +42,7 @@ def hull_tables(
     inverses: Floats,
     limits: Floats,
     condition: float,
-) -> tuple[Any, ...]:
+) -> HullTables:
     """The arguments of `raise_to` after the cells, from the shapes on the intervals.
 
     Args:
@@ -307,10 +307,8 @@ def is_excluded(
     """Whether no placement in the cell within the limit has a ‖Y‖ below `least`.
 
     Args:
-        node: (n,) intervals.
         points: (n_intervals, 4, n_modes) Bernstein points of the cubics.
         remainder: (n_intervals, n_modes) largest difference of the shapes from the cubics.
-        transforms: T (n_residual, n, n_columns).
         root, inverse_root, limit, eta: S^½ and S^-½ (n, n), L, and η < 1.
         least: y.
     """
@@ -335,8 +333,7 @@ def is_excluded(
     if not _evaluate(centre, transforms, root, 1.0, singular, inverse, y, f):
         return False
     chosen, w = np.zeros(n, np.int64), np.empty((n, n_points, n))
-    weights, constant = np.empty((n_residual, n)), np.empty((n, n))
-    at_centre, multiplier = np.empty(n), np.empty((n, n))
+    weights, constant, at_centre = np.empty((n_residual, n)), np.empty((n, n)), np.empty(n)
     _, sign = least_ratio(middle, middle, middle.shape[1], 1.0, -np.inf, singular, chosen)
     for _ in range(STEPS):
         size_y, size_f = np.sqrt(inner(y, y)), np.sqrt(inner(f, f))
@@ -363,9 +360,7 @@ def is_excluded(
         # first with the first half of the points alone, the ends of the intervals, which is cheap
         ratio, of_choice = least_ratio(b, w, n_points // 2, sign, -np.inf, singular, chosen)
         if ratio >= needed:
-            for i in range(n):
-                for c in range(n):
-                    multiplier[i, c] = 0.0
+            multiplier = np.zeros((n, n))
             for j in range(n):
                 for c in range(n):
                     at_centre[c] = constant[j, c]

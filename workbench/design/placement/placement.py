@@ -187,9 +187,6 @@ def _next_homes(positions: np.ndarray, homes: Sequence[Box], boxes: Sequence[Box
     return next_homes if changed else None
 
 
-# --- CasADi
-
-
 def symbolic_work(task: PlacementTask) -> ca.Function:
     """CasADi function positions -> (W_R, effort, B⁻¹, ‖B‖²) with exact derivatives; shapes are splines of degree seven.
 

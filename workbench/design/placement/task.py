@@ -309,13 +309,12 @@ def placement_task(
     a = modal_state_matrix(omega**2 + g1, rate)[np.ix_(states, states)]
     gains = np.hstack([np.diag(g1), np.diag(g2)])[:, states]
     slowest = -np.linalg.eigvals(a).real.max()
+    unit = unit[:, :, None] * np.eye(n)
     if np.isfinite(final_time):
         # subtract the transform of the forces after t_f
         end = expm(a * final_time)
         after = np.array([-gains @ np.linalg.solve(si * np.eye(len(a)) - a, end[:, -n:]) for si in s[:, 0]])
-        unit = unit[:, :, None] * np.eye(n) - after * np.exp(-s * final_time)[:, :, None]
-    else:
-        unit = unit[:, :, None] * np.eye(n)
+        unit = unit - after * np.exp(-s * final_time)[:, :, None]
     transforms = unit @ rates.T
     roots = np.array([symmetric_root((t @ t.conj().T).real) for t in transforms])
     # the root for one impulse has rank two; negligible columns are left out to save time

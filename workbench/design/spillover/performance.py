@@ -201,14 +201,13 @@ def through_sensors(
 ) -> tuple[tuple[Controller | None, Explanation | None, str], ...]:
     """Each law with each estimator that sensors at the places allow: a modal filter and a Luenberger observer.
 
+    Each is (controller, explanation on the full plant, ""), or (None, None, reason) where the design fails.
+
     Args:
         modes: controlled and residual.
         laws: to try.
         places: of the sensors: displacement for an observer, displacement and velocity for a filter.
         structure: gives the mass for the filters; without it filters are tried at named points alone.
-
-    Returns:
-        (controller, explanation on the full plant, "") each, or (None, None, reason) where the design fails.
     """
     sensor_places = sorted(set(places))
     sensors = [Sensor(f"y{i + 1}", x) for i, x in enumerate(sensor_places)]

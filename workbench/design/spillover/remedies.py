@@ -117,16 +117,16 @@ def spillover_remedies(
     remedies = []
     reduction = _smallest(lambda size: excess(replace(start, share=1.0 - size)), 1.0)
     if reduction is not None:
-        setting = replace(start, share=1.0 - reduction)
-        remedies.append(remedy("gain", f"gain scaled by {setting.share:.3f}", reduction, setting))
+        share = 1.0 - reduction
+        remedies.append(remedy("gain", f"gain scaled by {share:.3f}", reduction, replace(start, share=share)))
     for kind, movable in (("actuator", _actuators(start)), ("sensor", _sensors(start, domain))):
         best: tuple[str, float, _Setting] | None = None
         for name, where, put in movable:
             least = best[1] if best else np.inf
             moved = _smallest_move(domain, where, lambda at, put=put: excess(put(at)), least)  # type: ignore[misc]
             if moved is not None:
-                distance, at = moved
-                best = f"{name} moved to {domain.text(middle(at), digits=4)}", distance, put(at)
+                distance, end = moved
+                best = f"{name} moved to {domain.text(middle(end), digits=4)}", distance, put(end)
         if best is not None:
             remedies.append(remedy(kind, *best))
     added = _added(start, excess, domain, max_added)
