@@ -290,14 +290,15 @@ def _banded(
             f" {100 * uncertain.unexplained:.3g} % of the readings, of any phase and in any frequency band."
         )
     readings = np.array(truths)
-    over_time = _over_time(readings, sensors, rng)
+    median, lower, upper = _over_time(readings, sensors, rng)
     for i, truth in enumerate(readings):
         readings[i] = _read(truth, sensors, rng)
     sizes = np.array([amplitudes(reading) for reading in readings])
-    spectrum = np.quantile(sizes, QUANTILES, axis=0, method="weibull")
+    middle, least, most = np.quantile(sizes, QUANTILES, axis=0, method="weibull")
     channels = tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in sensors)
-    of_bands = time, channels, *over_time, frequencies, *spectrum, bands, np.zeros((0, len(sensors), 1 + len(bands)))
-    prediction = Prediction(*of_bands, name, tuple(notes), uncertain.unexplained)
+    in_time = time, channels, median, lower, upper
+    in_frequency = frequencies, middle, least, most, bands, np.zeros((0, len(sensors), 1 + len(bands)))
+    prediction = Prediction(*in_time, *in_frequency, name, tuple(notes), uncertain.unexplained)
     return replace(prediction, expected=np.array([prediction.coverage(reading) for reading in readings]))
 
 

@@ -123,12 +123,12 @@ def filtered(law: Law, filter_: ModalFilter) -> Controller:
     ]
     estimator = np.kron(np.eye(2), np.hstack(weights))
     empty = np.zeros((0, 0)), np.zeros((0, estimator.shape[1])), np.zeros((len(law.actuators), 0))
-    again = None if filter_.designed_by is None else partial(_filtered_anew, filter_.designed_by)
+    again = None if filter_.designed_by is None else partial(_redesigned, filter_.designed_by)
     name = f"{law.name} through a modal filter"
     return Controller(law, tuple(sensors), *empty, -law.gain @ estimator, name, estimator, again)
 
 
-def _filtered_anew(
+def _redesigned(
     design: Callable[[Modes, Sequence[int]], ModalFilter], modes: Modes, law: Law, sensors: Sequence[Sensor]
 ) -> Controller:
     """A law through a filter redesigned for other modes; the filter places the sensors, so `sensors` is not used."""

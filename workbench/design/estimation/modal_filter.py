@@ -102,7 +102,7 @@ def hermite_filter(modes: Modes, positions: ArrayLike, mass_per_length: ProfileL
         _weights(modes, as_profile(mass_per_length), x, CubicHermiteSpline(x, *values))
         for values in ((unit, zero), (zero, unit))
     )
-    again = partial(anew, hermite_filter, positions=x, mass_per_length=mass_per_length)
+    again = partial(_redesigned, hermite_filter, positions=x, mass_per_length=mass_per_length)
     return ModalFilter(x, displacement, slope, again)
 
 
@@ -129,7 +129,7 @@ def displacement_filter(
     degree -= 1 - degree % 2
     splines = make_interp_spline(nodes, np.eye(nodes.size), k=degree)
     weights = _weights(modes, as_profile(mass_per_length), np.unique(np.r_[0.0, splines.t, modes.length]), splines)
-    again = partial(anew, displacement_filter, positions=x, mass_per_length=mass_per_length, degree=degree)
+    again = partial(_redesigned, displacement_filter, positions=x, mass_per_length=mass_per_length, degree=degree)
     return ModalFilter(x, weights[:, np.isin(nodes, x)], np.zeros((modes.n_modes, 0)), again)
 
 
@@ -170,16 +170,13 @@ def point_filter(modes: Modes, points: Sequence[str], filtered: Sequence[int]) -
     slowest = modes.omega[modes.omega > 0].min(initial=np.inf)
     compliance = 1.0 / np.maximum(modes.omega, RIGID * slowest if np.isfinite(slowest) else 1.0)
     weights: Floats = (compliance[:, None] * np.linalg.pinv(shapes * compliance))[index]
-    again = partial(_at_points, names)
+    again = partial(filter_of_mass, None, places=names)
     return ModalFilter(np.array(names, object), weights, np.zeros((len(index), 0)), again)
 
 
-def _at_points(points: Sequence[str], modes: Modes, filtered: Sequence[int]) -> ModalFilter:
-    """`point_filter`, redesigned at the same points: a function of the module, so that a filter can be pickled."""
-    return point_filter(modes, points, filtered)
-
-
-def anew(design: Callable[..., ModalFilter], modes: Modes, filtered: Sequence[int], **settings: Any) -> ModalFilter:
+def _redesigned(
+    design: Callable[..., ModalFilter], modes: Modes, filtered: Sequence[int], **settings: Any
+) -> ModalFilter:
     """A filter by interpolation, redesigned for other modes, of which it needs the filtered ones alone."""
     return design(modes.select(list(filtered)), **settings)
 
@@ -245,7 +242,7 @@ def surface_filter(modes: Modes, places: ArrayLike, mass_per_area: FieldLike) ->
     filter_weights: Floats = (modes.phi(points) * density[:, None]).T @ splines(points)
     for part in modes.masses:
         filter_weights = filter_weights + part.mass * modes.phi(part.at).T @ splines(domain.locate(part.at))
-    again = partial(anew, surface_filter, places=at, mass_per_area=mass_per_area)
+    again = partial(filter_of_mass, mass_per_area, places=at)
     return ModalFilter(at, filter_weights[:, : len(at)], np.zeros((modes.n_modes, 0)), again)
 
 

@@ -53,11 +53,9 @@ class Law(Printed):
         index = tuple(whole(r, "each of Law.controlled, a mode counted from zero,") for r in self.controlled)
         object.__setattr__(self, "controlled", index)
         object.__setattr__(self, "actuators", tuple(self.actuators))
-        expected = (len(self.actuators), 2 * len(self.controlled))
-        if self.gain.shape != expected:
-            raise ValueError(
-                f"Law.gain must have shape (n_actuators, 2 n_controlled) = {expected}; got {self.gain.shape}"
-            )
+        shape, expected = self.gain.shape, (len(self.actuators), 2 * len(self.controlled))
+        if shape != expected:
+            raise ValueError(f"Law.gain must have shape (n_actuators, 2 n_controlled) = {expected}; got {shape}")
         if not np.isfinite(self.gain).all():
             raise ValueError(f"Law.gain must be finite; got {self.gain[~np.isfinite(self.gain)][0]}")
         if not index or len(set(index)) != len(index):
@@ -103,17 +101,14 @@ def positive_definite(value: ArrayLike, size: int, what: str) -> np.ndarray:
 
 def controlled_indices(modes: Modes, controlled: int | Sequence[int]) -> tuple[int, ...]:
     """Zero-based indices from a count of lowest modes or a list, checked to be distinct modes of the structure."""
-    if isinstance(controlled, np.integer):
-        controlled = int(controlled)
-    if isinstance(controlled, int) and not 1 <= controlled <= modes.n_modes:
-        raise DesignError(
-            f"the number of controlled modes is 1 to {modes.n_modes}, those of the model; got {controlled}"
-        )
-    index = tuple(int(r) for r in (range(controlled) if isinstance(controlled, int) else controlled))
-    if not index or len(set(index)) != len(index) or min(index) < 0 or max(index) >= modes.n_modes:
-        raise DesignError(
-            f"controlled modes {list(index)} are not distinct modes of the {modes.n_modes} at hand (from 0)"
-        )
+    n = modes.n_modes
+    if isinstance(controlled, int | np.integer):
+        if not 1 <= controlled <= n:
+            raise DesignError(f"the number of controlled modes is 1 to {n}, those of the model; got {controlled}")
+        return tuple(range(controlled))
+    index = tuple(map(int, controlled))
+    if not index or len(set(index)) != len(index) or min(index) < 0 or max(index) >= n:
+        raise DesignError(f"controlled modes {list(index)} are not distinct modes of the {n} at hand (from 0)")
     return index
 
 

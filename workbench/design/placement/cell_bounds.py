@@ -35,6 +35,9 @@ OF_JUMP = 26.0  # times h J / 192: largest error of a cubic at a jump J of the s
 NO_FORCE = 1e-15  # of the largest eigenvalue of S: one below is zero to round-off, as of two rigid modes moved alike
 FLAT = 1e-12  # of the same: with an eigenvalue between, S^-½ is not reliable, and the limit is left out
 
+# half-widths, tables, T, S and S^-½ and L of the limits, the limit of the condition, f, P
+Arguments = tuple[Floats, Tables, Floats, Floats, Floats, Floats, float, Floats, float]
+
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
@@ -122,7 +125,7 @@ class CellBounds:
                 regular.append(acting.all())
         matrices, roots, inverses = (np.array([part[i] for part in kept]).reshape(-1, n, n) for i in range(3))
         bounded = np.array([part[3] for part in kept])
-        self._arguments = (
+        self._arguments: Arguments = (
             table.half,
             (table.value, table.slope, table.curvature, table.most_curvature, table.most_rate),
             np.array(task.roots, order="C"),  # a writeable copy: numba would compile again for a read-only array
@@ -142,30 +145,17 @@ class CellBounds:
         """Lower bounds of √W_R (inf: no placement meets the limits), √W_R at the centres, and the axes to halve."""
         lower, work = np.empty(len(cells)), np.empty(len(cells))
         axis = np.empty(len(cells), np.int64)
-        _bounds(cells, *self._arguments, lower, work, axis)
+        _bounds(cells, self._arguments, lower, work, axis)
         for j in reversed(range(cells.shape[1] - 1)):  # halve an interval of two actuators first, to separate them
             axis[cells[:, j] == cells[:, j + 1]] = j
         if self._hull is not None and self.wanted > 0:
-            raise_to(self.wanted, cells, *self._hull, lower)
+            raise_to(self.wanted, cells, self._hull, lower)
         return lower, work, axis
 
 
 @njit(cache=True, nogil=True)
-def _bounds(
-    cells: Integers,
-    halves: Floats,
-    tables: Tables,
-    transforms: Floats,
-    squares: Floats,
-    inverses: Floats,
-    limits: Floats,
-    condition: float,
-    forces: Floats,
-    peak: float,
-    lower: Floats,
-    work: Floats,
-    axis: Integers,
-) -> None:
+def _bounds(cells: Integers, arguments: Arguments, lower: Floats, work: Floats, axis: Integers) -> None:
+    halves, tables, transforms, squares, inverses, limits, condition, forces, peak = arguments
     value, slope, _, most_curvature, _ = tables
     n_cells, n = cells.shape
     h, score = np.empty(n), np.empty(n)

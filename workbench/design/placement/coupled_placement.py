@@ -230,11 +230,9 @@ def scan_coupled(
     step = length / n_places
     grid = step * (0.5 + np.arange(n_places))
     index = np.array(list(combinations_with_replacement(range(n_places), n_actuators)))
-    costs = [
-        coupled_batch(modes, n_controlled, grid[part], **settings)
-        for part in np.array_split(index, max(1, len(index) // SCANNED))
-    ]
-    work, effort = (np.concatenate(parts) for parts in zip(*costs))
+    parts = np.array_split(index, max(1, len(index) // SCANNED))
+    costs = [coupled_batch(modes, n_controlled, grid[part], **settings) for part in parts]
+    work, effort = (np.concatenate(each) for each in zip(*costs))
     at = grid[index]
     gaps = least_distances(at)
     allowed = free_places(modes.domain, grid, intervals)[index].all(axis=1) & (gaps >= limits.spacing)

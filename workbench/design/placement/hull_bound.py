@@ -43,7 +43,7 @@ def hull_tables(
     limits: Floats,
     condition: float,
 ) -> HullTables:
-    """The arguments of `raise_to` after the cells, from the shapes on the intervals.
+    """The tables of `raise_to`, from the shapes on the intervals.
 
     Args:
         task: of the placement.
@@ -70,21 +70,9 @@ def hull_tables(
 
 
 @njit(cache=True, nogil=True)
-def raise_to(
-    wanted: float,
-    cells: Integers,
-    points: Floats,
-    remainder: Floats,
-    squared_norms: Floats,
-    squared_errors: Floats,
-    transforms: Floats,
-    roots: Floats,
-    inverses: Floats,
-    limits: Floats,
-    condition: float,
-    lower: Floats,
-) -> None:
+def raise_to(wanted: float, cells: Integers, tables: HullTables, lower: Floats) -> None:
     """Raise lower bounds (n_cells,) of √W_R of cells (n_cells, n_actuators) of intervals to `wanted` where proven."""
+    points, remainder, squared_norms, squared_errors, transforms, roots, inverses, limits, condition = tables
     n = cells.shape[1]
     for cell in range(len(cells)):
         node = cells[cell]

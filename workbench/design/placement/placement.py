@@ -137,9 +137,8 @@ def _guesses(
     nodes = nodes_of_mode(task.modes, n)
     if nodes.size == n:
         guesses.append(np.sort(nodes))
-    guesses += [
-        np.sort(rng.uniform(margin + INSIDE * length, length - margin - INSIDE * length, n)) for _ in range(starts)
-    ]
+    first, last = margin + INSIDE * length, length - margin - INSIDE * length
+    guesses += [np.sort(rng.uniform(first, last, n)) for _ in range(starts)]
     return [guess[:, None] for guess in guesses]
 
 

@@ -441,11 +441,8 @@ def batch_costs(task: PlacementTask, shapes: np.ndarray) -> Costs:
     )
     condition = np.linalg.norm(inverse, axis=(1, 2)) * np.linalg.norm(shapes[:, :, :n], axis=(1, 2))
     by_mode[singular] = np.inf
-    return Costs(
-        np.where(singular, np.inf, by_mode.sum(axis=1)),
-        by_mode,
-        *(np.where(singular, np.inf, x) for x in (effort, peak, condition)),
-    )
+    effort, peak, condition = (np.where(singular, np.inf, x) for x in (effort, peak, condition))
+    return Costs(by_mode.sum(axis=1), by_mode, effort, peak, condition)
 
 
 def batch_work(task: PlacementTask, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

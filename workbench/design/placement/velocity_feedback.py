@@ -50,12 +50,11 @@ class FeedbackTask:
 
     def __post_init__(self) -> None:
         freeze(self, "gain", "state")
-        if self.gain.ndim != 2 or self.gain.shape[0] != self.gain.shape[1]:
-            raise DesignError(f"the feedback gain must be square, one row per pair; got shape {self.gain.shape}")
-        if self.state.shape != (2 * self.modes.n_modes,):
-            raise DesignError(
-                f"the state has {2 * self.modes.n_modes} entries for {self.modes.n_modes} modes; got {self.state.shape}"
-            )
+        gain, state, n = self.gain.shape, self.state.shape, self.modes.n_modes
+        if len(gain) != 2 or gain[0] != gain[1]:
+            raise DesignError(f"the feedback gain must be square, one row per pair; got shape {gain}")
+        if state != (2 * n,):
+            raise DesignError(f"the state has {2 * n} entries for {n} modes; got {state}")
         if not (self.modes.omega > 0).all():
             raise DesignError("a rigid-body mode keeps its displacement under rate feedback; select the elastic modes")
         first, last = self.reach

@@ -89,12 +89,12 @@ def on_off_performance(
     """
     check_weight(weight)
     check_final_time(final_time)
-    response, instants = on_off_motion(modes, law, state, final_time)
-    used = float((response.forces**2).sum(axis=0) @ instants)
-    energy = float(2.0 * response.energy[list(law.controlled)].sum(axis=0) @ instants)
+    response, weights = on_off_motion(modes, law, state, final_time)
+    used = float((response.forces**2).sum(axis=0) @ weights)
+    energy = float(2.0 * response.energy[list(law.controlled)].sum(axis=0) @ weights)
     rest = [r for r in range(modes.n_modes) if r not in law.controlled]
     power = (input_matrix(modes, law.actuators)[rest] @ response.forces) * response.modal[modes.n_modes :][rest]
-    return Performance(energy + weight * used, used, float((power @ instants).sum()), np.nan)
+    return Performance(energy + weight * used, used, float((power @ weights).sum()), np.nan)
 
 
 def check_weight(weight: float) -> None:
