@@ -30,7 +30,7 @@ DRAWS, LEAST_DRAWS = 200, 40
 NOISES = 4  # realisations of noise per draw, for the bands over time
 MOST_BANDS = 8
 MOST_NUMBERS = 25_000_000  # readings of all draws in memory
-RUN_AWAY = 1e30  # readings, in any unit, above which a draw has diverged
+DIVERGED = 1e30  # readings, in any unit, above which a draw has diverged
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -274,7 +274,7 @@ def _banded(
     truths = [
         truth + _unexplained(truth, uncertain.unexplained, frequencies, bands, rng)
         for truth in drawn
-        if np.abs(truth).max() < RUN_AWAY
+        if np.abs(truth).max() < DIVERGED
     ]
     notes, diverging = [], len(drawn) - len(truths)
     if diverging > len(drawn) // 10:

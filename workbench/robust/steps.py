@@ -20,7 +20,7 @@ from workbench.robust.on_rig import redesigned_for, settings, tuned
 from workbench.robust.small_motion import loop_poles
 from workbench.robust.verification import settling
 
-AWAY = 1e3  # loss above which the motion is called divergent
+DIVERGENT = 1e3  # loss above which the motion is called divergent
 LOSS = "loss: vibration and effort above those with perfect actuators and sensors"
 LEAST_SHOWN = 1e-4  # loss below which its size is not stated
 GAINED = 0.005  # least reduction of the loss by a step; least change of the cost for a change of the controller
@@ -68,7 +68,7 @@ class Step:
     @property
     def diverges(self) -> bool:
         """Whether the motion grows so far that the loss is not stated in per cent."""
-        return not self.loss < AWAY
+        return not self.loss < DIVERGENT
 
     @property
     def in_new_controller(self) -> str:

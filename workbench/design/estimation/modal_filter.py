@@ -25,7 +25,7 @@ from workbench.structure.printed import Printed, counted, place_text
 from workbench.structure.profile import FieldLike, Profile, ProfileLike, as_field, as_profile
 
 GAUSS_POINTS = 24
-BLIND = 1e-6  # of the largest singular value of the shapes at the sensors: below, noise is amplified a million times
+INDISTINCT = 1e-6  # of the largest singular value of the shapes at the sensors: below, they amplify noise by a million
 RIGID = 1e-4  # of the slowest elastic frequency: that of a rigid mode here, at which it costs almost no energy
 READINGS = 3  # not on one line, to determine a plane
 PER_SIDE = 24  # zero displacements along a held edge of the longer side
@@ -161,7 +161,7 @@ def point_filter(modes: Modes, points: Sequence[str], filtered: Sequence[int]) -
         )
     shapes = modes.phi(names)
     _, singular_values, right = np.linalg.svd(shapes[:, index], full_matrices=False)
-    if singular_values[-1] < BLIND * singular_values[0]:
+    if singular_values[-1] < INDISTINCT * singular_values[0]:
         mixed = [str(index[i] + 1) for i in np.flatnonzero(np.abs(right[-1]) > 0.5 * np.abs(right[-1]).max())]
         raise ValueError(
             f"the sensors at {', '.join(names)} cannot distinguish filtered mode(s) {', '.join(mixed)} from rest or"

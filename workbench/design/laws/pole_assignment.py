@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from workbench.design.laws.law import DesignError
 
 ILL_CONDITIONED = 1e12  # condition number of X above which the poles count as not assignable
-STAYS = 1e-12  # of the pole: nearer to an open-loop pole it coincides with it, nearer to the real axis it is real
+COINCIDES = 1e-12  # of the pole: nearer to an open-loop pole it coincides with it, nearer to the real axis it is real
 
 
 def assign(a: np.ndarray, b: np.ndarray, poles: ArrayLike, directions: np.ndarray, names: Sequence[str]) -> np.ndarray:
@@ -33,13 +33,13 @@ def assign(a: np.ndarray, b: np.ndarray, poles: ArrayLike, directions: np.ndarra
     for pole, name in zip(poles, names, strict=True):
         if not pole.real < 0:
             raise DesignError(f"pole {pole:.4g} of {name} is not stable: its real part must be negative")
-        if abs(pole.imag) <= STAYS * abs(pole):
+        if abs(pole.imag) <= COINCIDES * abs(pole):
             raise DesignError(
                 f"pole {pole.real:.4g} of {name} is real; give one of a conjugate pair, off the real axis"
             )
     inputs = np.array(directions, complex)
     vectors, determinants = _resolvents(a, poles, b @ inputs)
-    coincides = np.abs(determinants) <= STAYS * np.abs(poles) ** 2
+    coincides = np.abs(determinants) <= COINCIDES * np.abs(poles) ** 2
     for r, mode in zip(*np.nonzero(coincides.T), strict=True):
         if r != mode:
             raise DesignError(

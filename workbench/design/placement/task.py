@@ -39,7 +39,7 @@ from workbench.structure.printed import Printed, command_headings, counted, in_u
 SINGULAR_SHARE = 1e-14  # of the product of B's row lengths: |det B| below which B counts as singular
 SHOWN_INSTANTS = 240  # at which modal forces are sampled
 SETTLED = 1e-3  # of its start: the slowest decay at the last of these instants
-NOTHING = 1e-7  # of the largest entry: columns of a root with smaller entries are left out
+NEGLIGIBLE = 1e-7  # of the largest entry: columns of a root with smaller entries are left out
 MOST_FORCES = 10_000_000  # computed at once, to bound the memory
 APART = 1e-6  # of the size of a patch: patches that overlap by less only touch
 SPREAD = "a spacing of their length, on a plate of their diagonal, prevents this"
@@ -319,7 +319,7 @@ def placement_task(
     roots = np.array([symmetric_root((t @ t.conj().T).real) for t in transforms])
     # the root for one impulse has rank two; negligible columns are left out to save time
     weights = np.abs(roots).max(axis=(0, 1))
-    roots = roots[:, :, weights > NOTHING * weights.max()]
+    roots = roots[:, :, weights > NEGLIGIBLE * weights.max()]
     ratio = (omega**2 + g1) / modes.omega[-1] ** 2
     envelope = np.full(n, np.inf)
     if np.isinf(final_time) and (ratio < 1).all():
