@@ -5,8 +5,7 @@ import numpy as np
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.loop.closed_loop import impulse_state
 from workbench.design.placement.certificate import certify
-from workbench.design.placement.coupled_placement import place_coupled
-from workbench.design.placement.coupled_scan import scan_coupled
+from workbench.design.placement.coupled_placement import place_coupled, scan_coupled
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.placement import nodes_of_mode, place_actuators, placement_task
 from workbench.design.spillover.spillover import quadratic_cost

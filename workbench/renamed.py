@@ -7,6 +7,7 @@ from warnings import warn
 
 P = ParamSpec("P")
 R = TypeVar("R")
+C = TypeVar("C", bound=type)
 
 
 class Renamed:
@@ -41,5 +42,15 @@ def former_arguments(**new_names: str) -> Callable[[Callable[P, R]], Callable[P,
             return function(*args, **kwargs)
 
         return with_former
+
+    return taking
+
+
+def former_fields(**new_names: str) -> Callable[[C], C]:
+    """A class whose constructor takes former names of its arguments too, as of `former_arguments`."""
+
+    def taking(owner: C) -> C:
+        owner.__init__ = former_arguments(**new_names)(owner.__init__)  # type: ignore[misc]
+        return owner
 
     return taking

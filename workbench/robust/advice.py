@@ -116,16 +116,14 @@ class Redesign:
     @property
     def _more(self) -> str:
         """Cost and work above what is allowed, in words; empty for none."""
-        cost = f"costs {{}} more, {'vibration' if self.criterion == 'cost' else 'time'} and effort taken together"
-        texts = cost, "takes {} more work"
-        over = zip(
-            texts, np.array(self._over) - 1.0, ("cost", "work"), (self.max_cost_increase, self.max_work_increase)
-        )
-        return ", and ".join(
-            f"{what.format(_percent(more))}: max_{name}_increase = {np.ceil(100.0 * more) / 100.0:g} allows it"
-            for what, more, name, allowed in over
-            if more > allowed
-        )
+        cost, work = (over - 1.0 for over in self._over)
+        what = "vibration" if self.criterion == "cost" else "time"
+        texts = []
+        if cost > self.max_cost_increase:
+            texts.append(f"costs {_percent(cost)} more, {what} and effort taken together: {_allowing('cost', cost)}")
+        if work > self.max_work_increase:
+            texts.append(f"takes {_percent(work)} more work: {_allowing('work', work)}")
+        return ", and ".join(texts)
 
     @cached_property
     def _over(self) -> tuple[float, float]:
@@ -153,7 +151,7 @@ class Redesign:
 
     @property
     def _used(self) -> Verification:
-        return self.verification if self.improves else self.present_verification
+        return self._both[self.improves]
 
     @property
     def mode(self) -> int:
@@ -246,9 +244,8 @@ class Redesign:
             return f"is stable on {_stable(new)} samples, the present one on {old.n_stable:,}"
         before, after = self._medians(self._settling)
         if self.criterion == "settling":
-            effort = self._times("effort")
-            settles = f"{self._settles(after, ' the controlled modes')} where the present one"
-            settles += f" {self._settles(before, ' them')}"
+            own, old_time = self._settles(after, " the controlled modes"), self._settles(before, " them")
+            settles, effort = f"{own} where the present one {old_time}", self._times("effort")
             return f"{settles}, for {effort}" if self._sooner_by > 0.0 else f"takes {effort} and {settles}"
         less = 1.0 - self._over[0]
         if self._sooner_by > 0.0 and self._sooner_by >= less:  # state the larger of the two gains
@@ -348,6 +345,10 @@ def _stable(verification: Verification) -> str:
 
 def _percent(share: float) -> str:
     return f"{100 * share:.0f} %" if share >= 0.1 else f"{100 * share:.2g} %"
+
+
+def _allowing(name: str, increase: float) -> str:
+    return f"max_{name}_increase = {np.ceil(100.0 * increase) / 100.0:g} allows it"
 
 
 def _ratios(values: np.ndarray, lead: str) -> str:

@@ -1,7 +1,6 @@
 """Validation of a model by a new record: the coverage of its prediction bands, and a log of such tests."""
 
 import csv
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -66,16 +65,16 @@ class PredictionCheck(Printed):
         return _least(_worst_shares(self.expected)[1])
 
     @property
-    def probability(self) -> float:
-        """The smaller of the p-values over time and in the frequency bands: two tests, each at the level UNLIKELY."""
-        return min(self._probabilities)
-
-    @property
     def _probabilities(self) -> tuple[float, float]:
         """p-values over time (worst sensor) and in the frequency bands (worst band, mean of the sensors)."""
         own = _worst_shares(np.column_stack([self.coverage, self.band_coverage]))
         over_time, in_bands = (float(np.mean(e <= o)) for e, o in zip(_worst_shares(self.expected), own))
         return over_time, in_bands
+
+    @property
+    def probability(self) -> float:
+        """The smaller of the p-values over time and in the frequency bands: two tests, each at the level UNLIKELY."""
+        return min(self._probabilities)
 
     @property
     def holds(self) -> bool:
@@ -162,11 +161,7 @@ def _least(shares: Floats) -> float:
 
 
 def check_length(record: Record) -> None:
-    """Refuse a record too short to be a test.
-
-    Raises:
-        ValueError: fewer than LEAST_SAMPLES samples.
-    """
+    """Refuse a record too short to be a test."""
     if record.n_samples < LEAST_SAMPLES:
         raise ValueError(
             f"record {record.name!r} has {record.n_samples} samples, too few to test a model: measure {LEAST_SAMPLES}"
@@ -193,24 +188,16 @@ def check_prediction(prediction: Prediction, record: Record) -> PredictionCheck:
             f"record {record.name!r} has no output {missing[0]!r}: it has {', '.join(measured)}; the prediction is of"
             f" {', '.join(names)}"
         )
-    expected = (prediction.time.size, prediction.sample_time)
-    if record.n_samples != expected[0] or abs(record.sample_time / expected[1] - 1.0) > 1e-6:
+    n_samples, sample_time = prediction.time.size, prediction.sample_time
+    if record.n_samples != n_samples or abs(record.sample_time / sample_time - 1.0) > 1e-6:
         raise ValueError(
             f"record {record.name!r} has {record.n_samples} samples of {record.sample_time:g} s; the prediction"
-            f" {expected[0]} of {expected[1]:g} s. Predict with this record's own inputs"
+            f" {n_samples} of {sample_time:g} s. Predict with this record's own inputs"
         )
     outputs = np.array([measured[name] for name in names])
     shares = prediction.coverage(outputs)
-    return PredictionCheck(
-        record.name,
-        tuple(names),
-        outputs.size,
-        shares[:, 0],
-        shares[:, 1:],
-        prediction.bands_hz,
-        prediction.expected,
-        prediction.allowed,
-    )
+    of_model = prediction.bands_hz, prediction.expected, prediction.allowed
+    return PredictionCheck(record.name, tuple(names), outputs.size, shares[:, 0], shares[:, 1:], *of_model)
 
 
 def log_test(path: str | Path, check: PredictionCheck) -> Path:
@@ -235,11 +222,8 @@ def log_test(path: str | Path, check: PredictionCheck) -> Path:
     lines = [row] if path.exists() else [COLUMNS, row]
     text = StringIO()
     csv.writer(text, lineterminator="\n").writerows([" ".join(str(value).split()) for value in line] for line in lines)
-    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-    try:
-        os.write(handle, text.getvalue().encode())
-    finally:
-        os.close(handle)
+    with path.open("ab", buffering=0) as file:
+        file.write(text.getvalue().encode())
     return path
 
 
@@ -258,9 +242,10 @@ def read_log(path: str | Path) -> list[dict[str, str]]:
 
 
 def _check_log(path: Path) -> None:
-    if path.exists():
-        with path.open(encoding="utf-8", errors="replace", newline="") as file:
-            if tuple(next(csv.reader(file), ())) != COLUMNS:
-                raise ValueError(
-                    f"{path} is no log of tests: its first line must be {','.join(COLUMNS)}; choose another file"
-                )
+    if not path.exists():
+        return
+    with path.open(encoding="utf-8", errors="replace", newline="") as file:
+        if tuple(next(csv.reader(file), ())) != COLUMNS:
+            raise ValueError(
+                f"{path} is no log of tests: its first line must be {','.join(COLUMNS)}; choose another file"
+            )

@@ -78,11 +78,7 @@ class _Model:
 
 
 def check_rate(modes: Modes, controlled: Sequence[int], sample_time: float) -> None:
-    """Refuse a sample time that is not positive or too long for the controlled modes, and modes that the rig lacks.
-
-    Raises:
-        DesignError: the message names the mode and the rate that it needs.
-    """
+    """Refuse a sample time that is not positive or too long for the controlled modes, and modes that the rig lacks."""
     if max(controlled) >= modes.n_modes:
         raise DesignError(
             f"the controller controls mode {max(controlled) + 1}, and the rig has {modes.n_modes} modes: design it for"
@@ -108,11 +104,6 @@ def compensated(rig: Rig, loop: Loop, sample_time: float, steps: Sequence[str] =
         loop: designed for the rig.
         sample_time: s.
         steps: of `STEPS`; "sensors" corrects gain, offset and cross-talk, and includes delays and lags in the model.
-
-    Raises:
-        DesignError: a rate too slow for the modes, or too fast for an actuator's delay; cross-talk that cannot be
-            undone.
-        ValueError: cross-talk into an actuator that the law does not drive.
     """
     check_rate(loop.modes, loop.law.controlled, sample_time)
     actuators = driven(rig, [a.name for a in loop.law.actuators])
@@ -157,9 +148,6 @@ def _through_crosstalk(
     """C, D, E and other parts of a digital controller that sends its commands through the inverse of the cross-talk.
 
     Limits and dead zones stay those of each actuator's own command.
-
-    Raises:
-        DesignError: cross-talk without an inverse.
     """
     mix = mixing(actuators)
     if np.linalg.cond(mix) > MIXED_ALIKE:
@@ -217,13 +205,7 @@ def _model(a: Floats, b: Floats, actuators: Sequence[Actuator], sample_time: flo
 
 
 def _matrices(model: _Model, loop: Loop, estimator: Floats, output: Floats) -> tuple[np.ndarray, ...]:
-    """A, B, C, D, E of the `DigitalController`: states X̂, then the delayed commands, newest first.
-
-    Args:
-        model, loop: of the controlled modes.
-        estimator: of the loop's controller.
-        output: of `_output`.
-    """
+    """A, B, C, D, E of the `DigitalController`: states X̂, then the delayed commands, newest first."""
     static, n, (n_x, n_u), n_y = loop.controller.static, model.n, model.b.shape, estimator.shape[1]
     observer = model.a.copy()
     if not static:
@@ -268,10 +250,8 @@ def _feedback(model: _Model, loop: Loop) -> np.ndarray:
         rows = np.zeros((len(law.relays), len(model.a)))
         rows[:, :half], rows[:, half:n] = np.diag([r.slope for r in law.relays]), np.eye(half)
         return rows
-    gain = np.zeros((law.gain.shape[0], len(model.a)))
-    gain[:, :n] = law.gain
-    feedback: Floats = -(gain + model.lags[:, None] * (gain @ model.a))
-    return feedback
+    gain = np.pad(law.gain, ((0, 0), (0, len(model.a) - n)))
+    return np.asarray(-(gain + model.lags[:, None] * (gain @ model.a)))
 
 
 def _output(loop: Loop, reads: Floats, sensors: Sequence[Sensor], hold: float, recalibrated: bool) -> Floats:
@@ -280,9 +260,8 @@ def _output(loop: Loop, reads: Floats, sensors: Sequence[Sensor], hold: float, r
     For a modal filter its estimator (n, n_channels) with the inverse of delays and lags at each mode's frequency.
 
     Args:
-        loop: of the controlled modes.
+        loop, sensors: of the rig.
         reads: C of the faultless sensors.
-        sensors: of the rig.
         hold: delay of the command by its hold, s, which an observer models as one of the sensors.
         recalibrated: whether delays and lags of the sensors are compensated.
     """
@@ -296,9 +275,8 @@ def _output(loop: Loop, reads: Floats, sensors: Sequence[Sensor], hold: float, r
     safe = np.maximum(omega, 1e-12)[:, None]
     orders = np.array([MEASURED[s.quantity][1] for s in sensors])
     of_q, of_v = np.where(orders == 0, q, 0.0), np.where(orders == 1, v, 0.0)
-    return np.vstack(
-        [of_q * inverse.real + of_v * inverse.imag / safe, of_v * inverse.real - of_q * inverse.imag * safe]
-    )
+    re, im = inverse.real, inverse.imag
+    return np.vstack([of_q * re + of_v * im / safe, of_v * re - of_q * im * safe])
 
 
 def _friction(rig: Rig, loop: Loop, forced: Floats, estimator: Floats, n_states: int) -> FrictionFeedforward | None:
@@ -307,7 +285,7 @@ def _friction(rig: Rig, loop: Loop, forced: Floats, estimator: Floats, n_states:
     Args:
         rig, loop: as of `compensated`.
         forced: B of the controlled modes.
-        estimator: of the loop's controller, from readings without cross-talk where that is compensated.
+        estimator: from readings without cross-talk where that is compensated.
         n_states: of the digital controller.
     """
     frictions = [element for element in rig.elements if isinstance(element, CoulombFriction)]
@@ -321,9 +299,8 @@ def _friction(rig: Rig, loop: Loop, forced: Floats, estimator: Floats, n_states:
     else:
         of_state[:, n : 2 * n] = shapes
     gain = np.linalg.pinv(forced[n:]) @ shapes.T
-    return FrictionFeedforward(
-        gain, of_state, of_reading, _values(frictions, "force"), _values(frictions, "smoothing_speed")
-    )
+    force, smoothing = (_values(frictions, name) for name in ("force", "smoothing_speed"))
+    return FrictionFeedforward(gain, of_state, of_reading, force, smoothing)
 
 
 def without_faults(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:

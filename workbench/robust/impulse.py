@@ -56,17 +56,15 @@ def impulse_test(
     test = LoopTest(n_samples, sample_time, impulse_at, seed=seed)
     if level is None:
         return test
-    damped = np.exp(-0.5 * np.diag(rig.modes.damping)[:, None] * test.time)
+    damped, speeds = np.exp(-0.5 * np.diag(rig.modes.damping)[:, None] * test.time), shape[:, None]
     omega = np.maximum(rig.modes.omega, 1e-9)[:, None]
-    motion = (
-        damped * np.sin(omega * test.time) * (shape[:, None] / omega),
-        damped * np.cos(omega * test.time) * shape[:, None],
-    )
-    peaks = []
-    for sensor, row, reached in zip(rig.sensors, output_matrix(rig.modes, rig.sensors), level, strict=True):
-        order = MEASURED[sensor.quantity][1]
-        if order < 2:
-            peaks.append(reached / max(np.abs(row @ motion[order]).max(), 1e-300))
+    motion = damped * np.sin(omega * test.time) * (speeds / omega), damped * np.cos(omega * test.time) * speeds
+    orders, rows = [MEASURED[s.quantity][1] for s in rig.sensors], output_matrix(rig.modes, rig.sensors)
+    peaks = [
+        reached / max(np.abs(row @ motion[order]).max(), 1e-300)
+        for order, row, reached in zip(orders, rows, level, strict=True)
+        if order < 2
+    ]
     return replace(test, impulse=float(np.median(peaks)) if peaks else 1.0)
 
 
@@ -102,15 +100,7 @@ def _place_of(domain: Domain, exciter: Actuator) -> Location:
 def impulse_speeds(
     modes: Modes, index: Sequence[int], impulse: float, at: Location | None, actuator: Actuator
 ) -> np.ndarray:
-    """|q_r'| (n_index,) just after an impulse, at least a tenth of the largest.
-
-    Args:
-        modes: of the structure.
-        index: of the modes wanted, zero-based.
-        impulse: N s.
-        at: the place; None for that of the actuator.
-        actuator: in whose direction the impulse then acts.
-    """
+    """|q_r'| (n_index,) just after an impulse, N s, at a place or by the actuator; at least a tenth of the largest."""
     shape = input_matrix(modes, [replace(actuator, gain=1.0, crosstalk=())])[:, 0] if at is None else modes.phi_at(at)
     speeds = np.abs(impulse * shape[list(index)])
     return np.asarray(np.maximum(speeds, 0.1 * speeds.max()))

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -15,7 +15,7 @@ from workbench.design.laws.coupled import controlled_plant
 from workbench.design.laws.imsc import imsc, pole_gains
 from workbench.design.laws.law import DesignError, Law, separation
 from workbench.design.laws.on_off import OnOffLaw
-from workbench.design.loop.rig_loop import LoopTest, named
+from workbench.design.loop.rig_loop import LoopTest, P, named
 from workbench.design.placement.task import PlacementTask
 from workbench.rig.actuators import Actuator, without_crosstalk
 from workbench.rig.rig import Rig
@@ -39,11 +39,7 @@ def law_of(design: Law | OnOffLaw | Controller) -> Law | OnOffLaw:
 
 
 def controlled_by(design: Design) -> tuple[int, ...]:
-    """The controlled modes of a design, zero-based.
-
-    Raises:
-        TypeError: neither a law, a controller nor a placement task.
-    """
+    """The controlled modes of a design, zero-based."""
     if not isinstance(design, Design):
         raise TypeError(
             f"the controller in use is a law, a controller or a placement task; got {type(design).__name__}: make one"
@@ -54,11 +50,7 @@ def controlled_by(design: Design) -> tuple[int, ...]:
 
 
 def loop_on_rig(rig: Rig, design: Design, test: LoopTest) -> Loop:
-    """A design on the sensors and actuators of a rig, matched by places and names; a law alone gets a Kalman filter.
-
-    Raises:
-        DesignError: a sensor or an actuator that the rig does not have, or a gain given by hand.
-    """
+    """A design on the sensors and actuators of a rig, matched by places and names; a law alone gets a Kalman filter."""
     if isinstance(design, PlacementTask):
         actuators = without_crosstalk([a for a in rig.actuators if not a.direct])
         design = imsc(rig.modes, design.n_controlled, actuators, weight=design.weight)
@@ -139,28 +131,35 @@ def _design_damping(modes: Modes, law: Law) -> np.ndarray:
 
 def _same_actuator(rig: Rig, wanted: Actuator) -> Actuator:
     """The rig's actuator of the same kind at the same place, by preference of the same name."""
-    near = [a for a in rig.actuators if a.quantity == wanted.quantity and separation(rig.modes, a, wanted) < SAME_PLACE]
+    near = _near(rig, rig.actuators, wanted)
     # an actuator of the same name at another place does not do: the gains are for their places
     match = next((a for a in near if a.name == wanted.name), next((a for a in near if not a.direct), None))
     if match is not None:
         return match
-    names = ", ".join(f"{a.name} ({a.quantity}) at {rig.modes.domain.text(a.at)}" for a in rig.actuators)
+    text = rig.modes.domain.text
+    names = ", ".join(f"{a.name} ({a.quantity}) at {text(a.at)}" for a in rig.actuators)
     raise DesignError(
-        f"the law drives {wanted.name} ({wanted.quantity}) at {rig.modes.domain.text(wanted.at)}, where the rig has no"
-        f" actuator: it has {names}; design the law for these"
+        f"the law drives {wanted.name} ({wanted.quantity}) at {text(wanted.at)}, where the rig has no actuator: it has"
+        f" {names}; design the law for these"
     )
 
 
 def _same_sensor(rig: Rig, wanted: Sensor) -> Sensor:
     """The rig's sensor of the same quantity at the same place, by preference of the same name."""
-    near = [s for s in rig.sensors if s.quantity == wanted.quantity and separation(rig.modes, s, wanted) < SAME_PLACE]
+    near = _near(rig, rig.sensors, wanted)
     if near:
         return next((s for s in near if s.name == wanted.name), near[0])
-    names = ", ".join(f"{s.name} ({s.quantity} at {rig.modes.domain.text(s.at)})" for s in rig.sensors)
+    text = rig.modes.domain.text
+    names = ", ".join(f"{s.name} ({s.quantity} at {text(s.at)})" for s in rig.sensors)
     raise DesignError(
-        f"the controller reads {wanted.quantity} at {rig.modes.domain.text(wanted.at)}, where the rig has no such"
-        f" sensor: it has {names}; design the estimator for these"
+        f"the controller reads {wanted.quantity} at {text(wanted.at)}, where the rig has no such sensor: it has"
+        f" {names}; design the estimator for these"
     )
+
+
+def _near(rig: Rig, parts: Sequence[P], wanted: P) -> list[P]:
+    """The parts of the same quantity at the same place."""
+    return [x for x in parts if x.quantity == wanted.quantity and separation(rig.modes, x, wanted) < SAME_PLACE]
 
 
 def redesigned_for(loop: Loop, rig: Rig, modes: Modes, removed: Sequence[str] = ()) -> Loop:
@@ -174,9 +173,6 @@ def redesigned_for(loop: Loop, rig: Rig, modes: Modes, removed: Sequence[str] = 
         rig: has the actuators and sensors of the loop, by name.
         modes: of the rig, linearised about its motion.
         removed: names of sensors not to be read.
-
-    Raises:
-        DesignError: modes that cannot be controlled or observed on that rig.
     """
     controlled = paired(loop.modes, modes, loop.law.controlled)
     actuators = without_crosstalk([named(rig.actuators, one.name) for one in loop.law.actuators])
@@ -203,12 +199,8 @@ def tuned(loop: Loop, rig: Rig, *, weight: float = 1.0, noise: float = 1.0) -> L
         rig: has the actuators and sensors of the loop, by name.
         weight: factor of the law's control weight.
         noise: factor of the noise intensity of a Kalman filter.
-
-    Raises:
-        DesignError: settings without a design.
     """
-    law: Any = loop.law
-    controller: Any = loop.controller
+    law, controller = cast(Any, loop.law), cast(Any, loop.controller)
     if weight != 1.0:
         if "weight" in settings(law):
             changed = {"weight": weight * np.asarray(settings(law)["weight"])}
@@ -259,11 +251,7 @@ def _redesigned_estimator(
 
 
 def paired(nominal: Modes, modes: Modes, controlled: Sequence[int]) -> tuple[int, ...]:
-    """Indices of the modes of a changed structure that pair with the controlled ones, by MAC; increasing.
-
-    Raises:
-        DesignError: more controlled modes than the changed structure has.
-    """
+    """Indices of the modes of a changed structure that pair with the controlled ones, by MAC; increasing."""
     if len(controlled) > modes.n_modes:
         raise DesignError(f"{len(controlled)} modes are controlled; the corrected rig has {modes.n_modes}")
     grid = nominal.domain.grid(8 * nominal.n_modes + 9)

@@ -81,14 +81,8 @@ class UncertainRig:
         nominal, best = verdict.nominal, verdict.attribution.best
         likely = [(fit, p) for fit, p in verdict.attribution.alternatives if p > LIKELY]
         alternatives = [(cls(nominal, fit.effects, _covariance(nominal, fit)), p) for fit, p in likely]
-        return cls(
-            nominal,
-            best.effects,
-            _covariance(nominal, best),
-            _unexplained(verdict),
-            verdict.outcome,
-            tuple(alternatives),
-        )
+        found = best.effects, _covariance(nominal, best), _unexplained(verdict), verdict.outcome
+        return cls(nominal, *found, tuple(alternatives))
 
     @cached_property
     def rig(self) -> Rig:
@@ -190,9 +184,7 @@ class UncertainRig:
         if unknown:
             raise ValueError(f"no effect is called {unknown[0]!r}; give a catalogue that contains it")
         for what, own in _nominal_json(nominal).items():
-            if what in LATER and what not in written["nominal"]:
-                continue
-            stated = written["nominal"][what]
+            stated = written["nominal"].get(what, own) if what in LATER else written["nominal"][what]
             if not _equal(stated, own):
                 raise ValueError(
                     f"the verdict is of another rig: its {what.replace('_', ' ')} are {_listed(stated)}, and here"

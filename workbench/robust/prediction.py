@@ -30,7 +30,7 @@ DRAWS, LEAST_DRAWS = 200, 40
 NOISES = 4  # realisations of noise per draw, for the bands over time
 MOST_BANDS = 8
 MOST_NUMBERS = 25_000_000  # readings of all draws in memory
-RUN_AWAY = 1e30  # readings, in any unit, above which a draw has diverged
+DIVERGED = 1e30  # readings, in any unit, above which a draw has diverged
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -160,12 +160,11 @@ def predict(
 def _above_nyquist(modes: Modes, period: float) -> tuple[str, ...]:
     """A note on the modes above the Nyquist frequency."""
     fast = [f"{f:.4g}" for f in modes.frequencies_hz if f > 0.5 / period]
-    if not fast:
-        return ()
-    return (
+    note = (
         f"Modes at {', '.join(fast)} Hz lie above the Nyquist frequency of {0.5 / period:.4g} Hz: the inputs do not"
-        " contain their excitation between samples, unless they were held as input_hold says; sample faster.",
+        " contain their excitation between samples, unless they were held as input_hold says; sample faster."
     )
+    return (note,) if fast else ()
 
 
 @one_blas_thread
@@ -227,12 +226,7 @@ def _with_noise(rig: Rig, noise: Floats) -> Rig:
 
 
 def check_draws(wanted: int) -> None:
-    """Refuse too few draws for the quantiles of a band.
-
-    Raises:
-        TypeError: not a number.
-        ValueError: fewer than LEAST_DRAWS.
-    """
+    """Refuse too few draws for the quantiles of a band."""
     if whole(wanted, WHAT_DRAWS, least=1) < LEAST_DRAWS:
         raise ValueError(f"bands of {100 * LEVEL:g} % need {LEAST_DRAWS} draws or more; got {wanted}")
 
@@ -255,7 +249,7 @@ def _loop_truth(rig: Rig, run: LoopRun, controller: DigitalController, sample_ti
     if not run.bounded:
         return np.full((len(rows), run.commands.shape[1]), np.inf)
     n = rig.modes.n_modes
-    forces = run.into @ run.response.forces
+    forces = run.participation @ run.response.forces
     stiffness = np.asarray(rig.modes.omega[:, None] ** 2, float)
     motion = Motion(run.response.modal[:n], run.response.modal[n:], forces, stiffness, rig.modes.damping, sample_time)
     plain = replace(rig, sensors=tuple(replace(s, limit=np.inf, step=0.0) for s in rig.sensors))
@@ -270,15 +264,9 @@ def _banded(
     rng: np.random.Generator,
     name: str,
 ) -> Prediction:
-    """The prediction with its bands, from the noise-free readings of each draw; diverging draws are left out.
+    """The prediction with its bands, from the noise-free readings (n_outputs, n_samples) of each draw.
 
-    Args:
-        uncertain: gives the modes, and the unexplained share that the bands allow for.
-        sensors: (n_outputs,) with the noise to be added.
-        drawn: (n_outputs, n_samples) noise-free readings of each draw.
-        time: (n_samples,) s.
-        rng: of the noise.
-        name: of the prediction.
+    The noise of the sensors is added. Diverging draws are left out.
     """
     period = float(time[1] - time[0])
     frequencies = np.asarray(np.fft.rfftfreq(time.size, period), float)
@@ -286,7 +274,7 @@ def _banded(
     truths = [
         truth + _unexplained(truth, uncertain.unexplained, frequencies, bands, rng)
         for truth in drawn
-        if np.abs(truth).max() < RUN_AWAY
+        if np.abs(truth).max() < DIVERGED
     ]
     notes, diverging = [], len(drawn) - len(truths)
     if diverging > len(drawn) // 10:
@@ -302,27 +290,15 @@ def _banded(
             f" {100 * uncertain.unexplained:.3g} % of the readings, of any phase and in any frequency band."
         )
     readings = np.array(truths)
-    median, low, high = _over_time(readings, sensors, rng)
+    median, lower, upper = _over_time(readings, sensors, rng)
     for i, truth in enumerate(readings):
         readings[i] = _read(truth, sensors, rng)
     sizes = np.array([amplitudes(reading) for reading in readings])
-    spectrum = np.quantile(sizes, QUANTILES, axis=0, method="weibull")
-    prediction = Prediction(
-        time,
-        tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in sensors),
-        median,
-        low,
-        high,
-        frequencies,
-        spectrum[0],
-        spectrum[1],
-        spectrum[2],
-        bands,
-        np.zeros((0, len(sensors), 1 + len(bands))),
-        name,
-        tuple(notes),
-        uncertain.unexplained,
-    )
+    middle, least, most = np.quantile(sizes, QUANTILES, axis=0, method="weibull")
+    channels = tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in sensors)
+    in_time = time, channels, median, lower, upper
+    in_frequency = frequencies, middle, least, most, bands, np.zeros((0, len(sensors), 1 + len(bands)))
+    prediction = Prediction(*in_time, *in_frequency, name, tuple(notes), uncertain.unexplained)
     return replace(prediction, expected=np.array([prediction.coverage(reading) for reading in readings]))
 
 

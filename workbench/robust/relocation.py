@@ -62,16 +62,11 @@ def relocated(loop: Loop, test: LoopTest, units: Units = SI) -> Relocation | Non
     """
     law, modes, at = loop.law, loop.modes, test.impulse_at
     n = len(law.controlled)
-    if (
-        getattr(law.designed_by, "func", None) is not imsc
-        or at is None
-        or isinstance(at, Between)
-        or n == modes.n_modes
-    ):
+    of_imsc = getattr(law.designed_by, "func", None) is imsc and law.controlled == tuple(range(n)) and n < modes.n_modes
+    by_forces = all(isinstance(a.at, float) and a.quantity == "force" for a in law.actuators)
+    if not (of_imsc and by_forces and len(law.actuators) == n and isinstance(modes.domain, Interval)):
         return None
-    if not isinstance(modes.domain, Interval) or law.controlled != tuple(range(n)) or len(law.actuators) != n:
-        return None
-    if not all(isinstance(a.at, float) and a.quantity == "force" for a in law.actuators):
+    if at is None or isinstance(at, Between):
         return None
     try:
         task = placement_task(modes, n, impulse_at=position(at), weight=settings(law)["weight"], impulse=test.impulse)

@@ -77,10 +77,8 @@ def loop_poles(rig: Rig, controller: DigitalController, modes: Modes | None = No
     rates = np.log(np.where(np.abs(poles) > 0, poles, 1e-300)) / controller.sample_time
     own = rates[np.argmax(participation, axis=1)]
     # a pole in the z plane does not distinguish aliases
-    sampling = 2.0 * np.pi / controller.sample_time
-    aliases = np.array(
-        [sign * own.imag + sampling * np.round((modes.omega - sign * own.imag) / sampling) for sign in (1, -1)]
-    )
+    sampling, signed = 2.0 * np.pi / controller.sample_time, np.array([own.imag, -own.imag])
+    aliases = signed + sampling * np.round((modes.omega - signed) / sampling)
     nearest = np.abs(aliases - modes.omega).argmin(axis=0)
     omega = np.take_along_axis(aliases, nearest[None], axis=0)[0]
     ratio = -own.real / np.maximum(np.hypot(own.real, omega), 1e-300)

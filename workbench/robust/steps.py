@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from workbench.robust.on_rig import redesigned_for, settings, tuned
 from workbench.robust.small_motion import loop_poles
 from workbench.robust.verification import settling
 
-AWAY = 1e3  # loss above which the motion is called divergent
+DIVERGENT = 1e3  # loss above which the motion is called divergent
 LOSS = "loss: vibration and effort above those with perfect actuators and sensors"
 LEAST_SHOWN = 1e-4  # loss below which its size is not stated
 GAINED = 0.005  # least reduction of the loss by a step; least change of the cost for a change of the controller
@@ -67,7 +68,7 @@ class Step:
     @property
     def diverges(self) -> bool:
         """Whether the motion grows so far that the loss is not stated in per cent."""
-        return not self.loss < AWAY
+        return not self.loss < DIVERGENT
 
     @property
     def in_new_controller(self) -> str:
@@ -90,9 +91,6 @@ class Search:
         steps: from the present controller on.
         weight: ρ of the cost J.
         criterion: see `Redesign`; "cost" where the test is too short for a settling time.
-
-    Raises:
-        DesignError: a rate too slow for the modes, or too fast for an actuator's delay.
     """
 
     def __init__(
@@ -159,9 +157,8 @@ class Search:
         # with limited forces the effort is low: more gain reduces vibration, and a slower filter keeps residual modes,
         # which a limited force cannot follow, out of the commands
         if any(np.isfinite(named(self._rig.actuators, a.name).limit) for a in designed.law.actuators):
-            for noise in SLOWER:
-                for weight in WEIGHTS:
-                    self._tune_once("gain", designed, weight, noise)
+            for noise, weight in product(SLOWER, WEIGHTS):
+                self._tune_once("gain", designed, weight, noise)
         designed = self.loop
         for noise in SPEEDS:
             self._tune_once("estimator", designed, 1.0, noise)
@@ -209,8 +206,7 @@ def _stabilised(rig: Rig, loop: Loop, test: LoopTest) -> tuple[Loop, str]:
     if np.isfinite(vibration(loop)):
         return loop, ""
     for weight in SOFTER:
-        designs = [(one, noise) for noise in SLOWEST if (one := _retuned(rig, loop, weight, noise)) is not None]
-        trials = [(vibration(one), one, noise) for one, noise in designs]
+        trials = [(vibration(one), one, noise) for noise in SLOWEST if (one := _retuned(rig, loop, weight, noise))]
         least, best, noise = min(trials, key=lambda trial: trial[0], default=(np.inf, loop, 1.0))
         if np.isfinite(least):
             return best, f", {_tuning(loop, weight, noise)}: otherwise unstable"
@@ -253,9 +249,7 @@ def _perfect(a: Actuator) -> Actuator:
 def force_weight(run: LoopRun, controlled: Sequence[int]) -> float:
     """ρ of the cost 2 ∫ energy dt + ρ ∫ FᵀF dt for which both terms are equal over the controlled modes.
 
-    Args:
-        run: of the reference loop, with perfect actuators and sensors.
-        controlled: zero-based modes.
+    The run is that of the reference loop, with perfect actuators and sensors.
     """
     return 2.0 * _vibration(run, controlled) / max(run.effort, 1e-300)
 

@@ -14,6 +14,7 @@ from workbench.renamed import Renamed, former_arguments
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import PeriodicForce, RandomForce
 from workbench.rig.rig import Rig, shape_of
+from workbench.rig.sensors import Sensor
 from workbench.robust.posterior import WHAT_DRAWS, UncertainRig
 from workbench.robust.small_motion import loop_poles, modes_in_motion, small_gain_margin
 from workbench.structure.domain import NamedPoints, middle
@@ -103,24 +104,20 @@ class Verification:
 
     def to_json(self) -> dict[str, Any]:
         """Median and 95 % interval of each quantity, as JSON numbers; null where not finite."""
-        quantities = {
-            "worst_damping": self.worst_damping,
-            "peak_force": self.peak_force,
-            "stroke": self.stroke,
-            "W_C": self.controlled_work,
-            "W_R": self.residual_work,
-            "effort": self.effort,
-            "vibration": self.vibration,
-            "settling": self.settling,
-            "controlled_settling": self.controlled_settling,
-        }
+
+        def of(*names: str) -> dict[str, Any]:
+            return {name: all_rounded(interval(getattr(self, name))) for name in names}
+
         return {
             "draws": self.n_draws,
             "stable": self.n_stable,
             "small_gain_margin": rounded(self.small_gain_margin),
             "margin_frequency_hz": rounded(self.margin_frequency_hz),
             "damping": [all_rounded(interval(self.damping[:, r])) for r in self.controlled],
-            **{name: all_rounded(interval(values)) for name, values in quantities.items()},
+            **of("worst_damping", "peak_force", "stroke"),
+            "W_C": all_rounded(interval(self.controlled_work)),
+            "W_R": all_rounded(interval(self.residual_work)),
+            **of("effort", "vibration", "settling", "controlled_settling"),
         }
 
 
@@ -187,9 +184,8 @@ def verify(
 
     results = zip(*of_loops(rigs, controller, test, drawn))
     stable, damping, peak_force, stroke, work, effort, energies, of_controlled = results
-    margin, frequency = small_gain_margin(
-        margin_rig, controller, modes_in_motion(margin_rig, run_loop(margin_rig, controller, test))
-    )
+    modes = modes_in_motion(margin_rig, run_loop(margin_rig, controller, test))
+    margin, frequency = small_gain_margin(margin_rig, controller, modes)
     dt = test.sample_time
     with np.errstate(over="ignore", invalid="ignore"):
         return Verification(
@@ -230,11 +226,7 @@ def _check_kinds(uncertain: object, controller: object, test: object, margin_rig
 
 
 def check_loop_kinds(controller: object, test: object) -> None:
-    """Refuse a controller that is not a `DigitalController`, or a test that is not a `LoopTest`.
-
-    Raises:
-        TypeError: with the way to make one.
-    """
+    """Refuse a controller that is not a `DigitalController`, or a test that is not a `LoopTest`."""
     if not isinstance(controller, DigitalController):
         raise TypeError(
             f"the controller must be a DigitalController; got {type(controller).__name__}: make one of a law and an"
@@ -244,11 +236,7 @@ def check_loop_kinds(controller: object, test: object) -> None:
 
 
 def check_test(test: object) -> None:
-    """Refuse a test that is not a `LoopTest`.
-
-    Raises:
-        TypeError: with the way to make one.
-    """
+    """Refuse a test that is not a `LoopTest`."""
     if not isinstance(test, LoopTest):
         raise TypeError(
             f"the test must be a LoopTest; got {type(test).__name__}: make one by LoopTest(n_samples, sample_time,"
@@ -262,15 +250,11 @@ def drawn_with_errors(uncertain: UncertainRig, draws: int, seed: int = 0) -> tup
     rigs = uncertain.draws(draws, rng)
     if not uncertain.unexplained:
         return rigs
-    return tuple(
-        replace(
-            rig,
-            sensors=tuple(
-                replace(s, gain=s.gain * (1.0 + uncertain.unexplained * rng.uniform(-1.0, 1.0))) for s in rig.sensors
-            ),
-        )
-        for rig in rigs
-    )
+
+    def erring(sensor: Sensor) -> Sensor:
+        return replace(sensor, gain=sensor.gain * (1.0 + uncertain.unexplained * rng.uniform(-1.0, 1.0)))
+
+    return tuple(replace(rig, sensors=tuple(map(erring, rig.sensors))) for rig in rigs)
 
 
 def _finite(values: ArrayLike) -> np.ndarray:

@@ -227,6 +227,6 @@ def test_a_test_and_its_run_cannot_be_written_to(rig):
     forces[:] = 9.0
     assert not test.forces.any()
     run = run_loop(rig, restless(rig), test)
-    for array in (test.forces, run.commands, run.elements, run.into):
+    for array in (test.forces, run.commands, run.elements, run.participation):
         with pytest.raises(ValueError, match="read-only"):
             array[...] = 1.0

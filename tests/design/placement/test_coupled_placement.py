@@ -8,8 +8,7 @@ import pytest
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.law import DesignError
 from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
-from workbench.design.placement.coupled_placement import coupled_batch, coupled_costs, place_coupled
-from workbench.design.placement.coupled_scan import scan_coupled
+from workbench.design.placement.coupled_placement import coupled_batch, coupled_costs, place_coupled, scan_coupled
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.task import placement_task
 from workbench.design.spillover.spillover import effort, spillover

@@ -9,7 +9,7 @@ from scipy.optimize import differential_evolution
 
 from workbench.design.placement.cell_bounds import CellBounds, Intervals
 from workbench.design.placement.certificate import certify
-from workbench.design.placement.hull_bound import ROUND_OFF, SINGULAR, HullBound, least_ratio
+from workbench.design.placement.hull_bound import ROUND_OFF, SINGULAR, hull_tables, least_ratio
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.placement import placement_task
 from workbench.design.placement.task import batch_costs
@@ -88,7 +88,7 @@ def test_ratios_are_exact_enough_where_several_pivots_are_small(hinged_modes):
     """Six actuators of which some all but meet: pivots shrink one after the other, and round-off grows with each."""
     n, rng, finite = 6, np.random.default_rng(0), 0
     task, effort = evenly(hinged_modes(10), n, 10.0)
-    points = CellBounds(task, Limits(effort=effort))._hull._arguments[0]
+    points = CellBounds(task, Limits(effort=effort))._hull[0]
     for cell in cells_that_meet(rng, n, [6, 9], 150):
         at = points[cell, rng.integers(0, 4, n)]
         b, w = at[:, :n].copy(), at[:, n:] @ rng.normal(size=(task.modes.n_modes - n, n))
@@ -128,8 +128,8 @@ def test_shapes_stay_by_the_parabolas_and_the_cubics(member, patched):
     task = placement_task(member_modes(member, 9), 4, impulse_at=6.3, weight=20.0, actuator=actuator)
     table, rng = Intervals.of(task), np.random.default_rng(5)
     identity = np.eye(4)[None]
-    hull = HullBound(task, (table.centre, table.half, table.most_fourth), identity, identity, np.ones(1), np.inf)
-    points, remainder = hull._arguments[:2]
+    measures = table.centre, table.half, table.most_fourth
+    points, remainder = hull_tables(task, measures, identity, identity, np.ones(1), np.inf)[:2]
     breaks = (3.6, 4.6) if patched else (4.1,)
     near = [np.flatnonzero(np.abs(table.centre - x) < 2.0 * table.half) for x in breaks]
     nodes = np.concatenate([rng.choice(len(table.half), 200), *near])

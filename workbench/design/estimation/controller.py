@@ -14,7 +14,7 @@ import numpy as np
 
 from workbench.design.estimation.modal_filter import ModalFilter
 from workbench.design.laws.law import Law, linear
-from workbench.renamed import Renamed, former_arguments
+from workbench.renamed import Renamed, former_fields
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.statespace import output_matrix, signal_names
 from workbench.structure.domain import Place
@@ -22,6 +22,7 @@ from workbench.structure.modes import Modes, freeze
 from workbench.structure.printed import Printed, counted, place_text
 
 
+@former_fields(state="A", reads="B", commands="C", direct="D", estimator="L")
 @dataclass(frozen=True, eq=False, repr=False)
 class Controller(Printed):
     """A law with its state estimator, a modal filter or an observer.
@@ -80,17 +81,8 @@ class Controller(Printed):
         return control.ss(self.A, self.B, self.C, self.D, **names)
 
 
-Controller.__init__ = former_arguments(  # type: ignore[method-assign]
-    state="A", reads="B", commands="C", direct="D", estimator="L"
-)(Controller.__init__)
-
-
 def check_readable(sensors: Sequence[Sensor]) -> None:
-    """Refuse sensors that do not read the state alone.
-
-    Raises:
-        ValueError: an accelerometer.
-    """
+    """Refuse accelerometers, whose readings are not of the state alone."""
     for sensor in sensors:
         if MEASURED[sensor.quantity][1] > 1:
             raise ValueError(
@@ -99,11 +91,7 @@ def check_readable(sensors: Sequence[Sensor]) -> None:
 
 
 def reading(modes: Modes, sensors: Sequence[Sensor]) -> np.ndarray:
-    """R (n_channels, 2 n_modes), from the state (q, q') to the readings, lags and delays left out.
-
-    Raises:
-        ValueError: an accelerometer.
-    """
+    """R (n_channels, 2 n_modes), from the state (q, q') to the readings, lags and delays left out."""
     check_readable(sensors)
     shapes = output_matrix(modes, sensors)
     rates = np.array([MEASURED[sensor.quantity][1] for sensor in sensors])[:, None]
@@ -135,12 +123,12 @@ def filtered(law: Law, filter_: ModalFilter) -> Controller:
     ]
     estimator = np.kron(np.eye(2), np.hstack(weights))
     empty = np.zeros((0, 0)), np.zeros((0, estimator.shape[1])), np.zeros((len(law.actuators), 0))
-    again = None if filter_.designed_by is None else partial(_filtered_anew, filter_.designed_by)
+    again = None if filter_.designed_by is None else partial(_redesigned, filter_.designed_by)
     name = f"{law.name} through a modal filter"
     return Controller(law, tuple(sensors), *empty, -law.gain @ estimator, name, estimator, again)
 
 
-def _filtered_anew(
+def _redesigned(
     design: Callable[[Modes, Sequence[int]], ModalFilter], modes: Modes, law: Law, sensors: Sequence[Sensor]
 ) -> Controller:
     """A law through a filter redesigned for other modes; the filter places the sensors, so `sensors` is not used."""

@@ -19,7 +19,7 @@ from scipy.signal import cont2discrete
 from workbench.arguments import number
 from workbench.arrays import Floats
 from workbench.design.estimation.controller import Controller
-from workbench.renamed import Renamed, former_arguments
+from workbench.renamed import Renamed, former_fields
 from workbench.rig.statespace import signal_names
 from workbench.structure.modes import freeze, frozen
 
@@ -60,6 +60,7 @@ class FrictionFeedforward:
     smoothing: np.ndarray
 
 
+@former_fields(**{letter.lower(): letter for letter in "ABCDE"})
 @dataclass(frozen=True, eq=False)
 class DigitalController:
     """A controller that runs once a sample.
@@ -160,11 +161,6 @@ class DigitalController:
         return control.ss(a, b, self.C, self.D * self.scale, self.sample_time, **names)
 
 
-DigitalController.__init__ = former_arguments(  # type: ignore[method-assign]
-    **{letter.lower(): letter for letter in "ABCDE"}
-)(DigitalController.__init__)
-
-
 def modal_states(modes: Sequence[int]) -> tuple[str, ...]:
     """The states of an observer of these modes (zero-based), in words: displacements, then rates."""
     kinds = (("displacement", "kg^0.5 m"), ("rate", "kg^0.5 m/s"))
@@ -187,23 +183,16 @@ def sampled(controller: Controller, sample_time: float) -> DigitalController:
     if not isinstance(controller, Controller):
         raise TypeError(
             f"the controller must be a law on an estimator; got {type(controller).__name__}: make one by"
-            " kalman_controller, luenberger_controller or filtered"
+            " kalman_controller, luenberger_controller or filtered; a DigitalController is sampled already,"
+            " write_controller writes it"
         )
     if not 0 < number(sample_time, "sample_time", "s") < np.inf:
         raise ValueError(f"sample_time must be above 0; got {sample_time:g} s")
     a, b = zero_order_hold(controller.A, controller.B, sample_time)
-    return DigitalController(
-        sample_time,
-        tuple(sensor.name for sensor in controller.sensors),
-        tuple(actuator.name for actuator in controller.law.actuators),
-        a,
-        b,
-        controller.C,
-        controller.D,
-        np.zeros(controller.C.T.shape),
-        name=controller.name,
-        states=() if controller.static else modal_states(controller.law.controlled),
-    )
+    names = tuple(s.name for s in controller.sensors), tuple(a.name for a in controller.law.actuators)
+    c, d, e = controller.C, controller.D, np.zeros(controller.C.T.shape)
+    states = () if controller.static else modal_states(controller.law.controlled)
+    return DigitalController(sample_time, *names, a, b, c, d, e, name=controller.name, states=states)
 
 
 def zero_order_hold(a: Floats, b: Floats, span: float) -> tuple[Floats, Floats]:

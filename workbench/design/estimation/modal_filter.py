@@ -25,7 +25,7 @@ from workbench.structure.printed import Printed, counted, place_text
 from workbench.structure.profile import FieldLike, Profile, ProfileLike, as_field, as_profile
 
 GAUSS_POINTS = 24
-BLIND = 1e-6  # of the largest singular value of the shapes at the sensors: below, noise is amplified a million times
+INDISTINCT = 1e-6  # of the largest singular value of the shapes at the sensors: below, they amplify noise by a million
 RIGID = 1e-4  # of the slowest elastic frequency: that of a rigid mode here, at which it costs almost no energy
 READINGS = 3  # not on one line, to determine a plane
 PER_SIDE = 24  # zero displacements along a held edge of the longer side
@@ -71,10 +71,8 @@ class ModalFilter(Printed):
 
     def __call__(self, displacement: ArrayLike, slope: ArrayLike | None = None) -> Floats:
         """Modal coordinates (n_modes, ...) from readings (n_sensors, ...), time last."""
-        modal: Floats = self.displacement @ np.asarray(displacement, float)
-        if slope is not None and self.slope.size:
-            modal = modal + self.slope @ np.asarray(slope, float)
-        return modal
+        modal = np.asarray(self.displacement @ np.asarray(displacement, float))
+        return modal if slope is None or not self.slope.size else modal + self.slope @ np.asarray(slope, float)
 
     seen = Renamed("response_to")
 
@@ -104,7 +102,7 @@ def hermite_filter(modes: Modes, positions: ArrayLike, mass_per_length: ProfileL
         _weights(modes, as_profile(mass_per_length), x, CubicHermiteSpline(x, *values))
         for values in ((unit, zero), (zero, unit))
     )
-    again = partial(anew, hermite_filter, positions=x, mass_per_length=mass_per_length)
+    again = partial(_redesigned, hermite_filter, positions=x, mass_per_length=mass_per_length)
     return ModalFilter(x, displacement, slope, again)
 
 
@@ -131,7 +129,7 @@ def displacement_filter(
     degree -= 1 - degree % 2
     splines = make_interp_spline(nodes, np.eye(nodes.size), k=degree)
     weights = _weights(modes, as_profile(mass_per_length), np.unique(np.r_[0.0, splines.t, modes.length]), splines)
-    again = partial(anew, displacement_filter, positions=x, mass_per_length=mass_per_length, degree=degree)
+    again = partial(_redesigned, displacement_filter, positions=x, mass_per_length=mass_per_length, degree=degree)
     return ModalFilter(x, weights[:, np.isin(nodes, x)], np.zeros((modes.n_modes, 0)), again)
 
 
@@ -163,7 +161,7 @@ def point_filter(modes: Modes, points: Sequence[str], filtered: Sequence[int]) -
         )
     shapes = modes.phi(names)
     _, singular_values, right = np.linalg.svd(shapes[:, index], full_matrices=False)
-    if singular_values[-1] < BLIND * singular_values[0]:
+    if singular_values[-1] < INDISTINCT * singular_values[0]:
         mixed = [str(index[i] + 1) for i in np.flatnonzero(np.abs(right[-1]) > 0.5 * np.abs(right[-1]).max())]
         raise ValueError(
             f"the sensors at {', '.join(names)} cannot distinguish filtered mode(s) {', '.join(mixed)} from rest or"
@@ -172,16 +170,13 @@ def point_filter(modes: Modes, points: Sequence[str], filtered: Sequence[int]) -
     slowest = modes.omega[modes.omega > 0].min(initial=np.inf)
     compliance = 1.0 / np.maximum(modes.omega, RIGID * slowest if np.isfinite(slowest) else 1.0)
     weights: Floats = (compliance[:, None] * np.linalg.pinv(shapes * compliance))[index]
-    again = partial(_at_points, names)
+    again = partial(filter_of_mass, None, places=names)
     return ModalFilter(np.array(names, object), weights, np.zeros((len(index), 0)), again)
 
 
-def _at_points(points: Sequence[str], modes: Modes, filtered: Sequence[int]) -> ModalFilter:
-    """`point_filter`, redesigned at the same points: a function of the module, so that a filter can be pickled."""
-    return point_filter(modes, points, filtered)
-
-
-def anew(design: Callable[..., ModalFilter], modes: Modes, filtered: Sequence[int], **settings: Any) -> ModalFilter:
+def _redesigned(
+    design: Callable[..., ModalFilter], modes: Modes, filtered: Sequence[int], **settings: Any
+) -> ModalFilter:
     """A filter by interpolation, redesigned for other modes, of which it needs the filtered ones alone."""
     return design(modes.select(list(filtered)), **settings)
 
@@ -247,40 +242,29 @@ def surface_filter(modes: Modes, places: ArrayLike, mass_per_area: FieldLike) ->
     filter_weights: Floats = (modes.phi(points) * density[:, None]).T @ splines(points)
     for part in modes.masses:
         filter_weights = filter_weights + part.mass * modes.phi(part.at).T @ splines(domain.locate(part.at))
-    again = partial(anew, surface_filter, places=at, mass_per_area=mass_per_area)
+    again = partial(filter_of_mass, mass_per_area, places=at)
     return ModalFilter(at, filter_weights[:, : len(at)], np.zeros((modes.n_modes, 0)), again)
 
 
 def filter_on(
     structure: Structure | Plate | Membrane | None, modes: Modes, filtered: Sequence[int], places: ArrayLike
 ) -> ModalFilter:
-    """The displacement filter that fits a structure: along it, over it, or at its named points.
-
-    Args:
-        structure: gives the mass; None at named points.
-        modes: of the structure, all that are known.
-        filtered: indices of the modes to be filtered, from 0.
-        places: of the sensors, in any order.
-
-    Raises:
-        ValueError: no structure where one is needed, or sensors that make no filter.
-    """
-    mass: ProfileLike | FieldLike | None = None
+    """The displacement filter that fits a structure, which may be None at named points: see `filter_of_mass`."""
     if isinstance(structure, Plate | Membrane):
-        mass = structure.mass_per_area
-    elif structure is not None:
-        mass = structure.mass_per_length
-    return filter_of_mass(mass, modes, filtered, places)
+        return filter_of_mass(structure.mass_per_area, modes, filtered, places)
+    return filter_of_mass(None if structure is None else structure.mass_per_length, modes, filtered, places)
 
 
 def filter_of_mass(
     mass: ProfileLike | FieldLike | None, modes: Modes, filtered: Sequence[int], places: ArrayLike
 ) -> ModalFilter:
-    """The filter of `filter_on`, from the distribution of mass instead of the structure.
+    """The displacement filter along a structure, over it, or at its named points.
 
     Args:
         mass: kg/m along a structure, kg/m² over a surface; not needed at named points.
-        modes, filtered, places: as in `filter_on`.
+        modes: of the structure, all that are known.
+        filtered: indices of the modes to be filtered, from 0.
+        places: of the sensors, in any order.
 
     Raises:
         ValueError: no mass where it is needed, or sensors that make no filter.

@@ -24,6 +24,8 @@ UNOBSERVABLE = 1e-9  # of a mode's largest displacement: a smaller reading does 
 # pole over ω: as fast as the observed mode, and damped enough that the initial error decays within two periods
 USUAL = -0.3 + 1j
 
+Plant = tuple[Floats, Floats, Floats]  # A, B, C
+
 
 def luenberger_controller(modes: Modes, law: Law, sensors: Sequence[Sensor], *, poles: ArrayLike) -> Controller:
     """The controller of a law on the state of a Luenberger observer.
@@ -37,22 +39,19 @@ def luenberger_controller(modes: Modes, law: Law, sensors: Sequence[Sensor], *, 
     Raises:
         DesignError: a mode that no sensor observes, or poles that these sensors cannot assign.
     """
-    a, b, c = observed_plant(modes, law, sensors)
+    plant = a, _, c = observed_plant(modes, law, sensors)
     n = law.n_controlled
     names = [f"mode {r + 1} of the observer" for r in law.controlled]
     # of the motion (q_r, q_r' = λ q_r) of mode r the sensors read c_q + λ c_v
     outputs = c[:, :n] + 1j * modes.omega[list(law.controlled)] * c[:, n:]
     gain = assign(a.T, c.T, poles, outputs.conj(), names).T
-    return _controller(law, sensors, a, b, c, gain, "Luenberger observer", partial(luenberger_controller, poles=poles))
+    return _controller(law, sensors, plant, gain, "Luenberger observer", partial(luenberger_controller, poles=poles))
 
 
 def usual_poles(modes: Modes, controlled: Sequence[int]) -> Complexes:
     """Default poles (n_controlled,) of an observer's estimation error, rad/s: (-0.3 + i) ω of each mode.
 
     Rigid modes have no frequency: ω is then evenly spaced below that of the slowest elastic mode.
-
-    Raises:
-        DesignError: rigid modes alone.
     """
     omega = np.array(modes.omega[list(controlled)])
     rigid, elastic = omega == 0, modes.omega[modes.omega > 0]
@@ -62,8 +61,7 @@ def usual_poles(modes: Modes, controlled: Sequence[int]) -> Complexes:
             " poles, or use kalman_controller"
         )
     omega[rigid] = elastic[:1] * np.arange(1, rigid.sum() + 1) / (rigid.sum() + 1)
-    poles: Complexes = USUAL * omega
-    return poles
+    return np.asarray(USUAL * omega)
 
 
 def kalman_controller(
@@ -81,7 +79,7 @@ def kalman_controller(
     Raises:
         DesignError: a mode that no sensor observes, intensities that are not positive.
     """
-    a, b, c = observed_plant(modes, law, sensors)
+    plant = a, _, c = observed_plant(modes, law, sensors)
     n = law.n_controlled
     process = positive_definite(disturbance, n, "the disturbance intensity")
     measurement = positive_definite(noise, len(sensors), "the noise intensity")
@@ -92,15 +90,11 @@ def kalman_controller(
             f"the Kalman filter's Riccati equation has no stabilising solution: {error}; move or add a sensor"
         ) from error
     again = partial(kalman_controller, disturbance=disturbance, noise=noise)
-    return _controller(law, sensors, a, b, c, np.asarray(gain), "Kalman filter", again)
+    return _controller(law, sensors, plant, np.asarray(gain), "Kalman filter", again)
 
 
-def observed_plant(modes: Modes, law: Law, sensors: Sequence[Sensor]) -> tuple[Floats, Floats, Floats]:
-    """A, B and C of the controlled modes alone, from forces to readings.
-
-    Raises:
-        DesignError: a law that has no gain, no sensors, or a mode that none of them observes.
-    """
+def observed_plant(modes: Modes, law: Law, sensors: Sequence[Sensor]) -> Plant:
+    """A, B and C of the controlled modes alone, from forces to readings, checked to be observable."""
     law = linear(law)
     index = list(law.controlled)
     own = modes.select(index)
@@ -127,15 +121,9 @@ def observed_plant(modes: Modes, law: Law, sensors: Sequence[Sensor]) -> tuple[F
 
 
 def _controller(
-    law: Law,
-    sensors: Sequence[Sensor],
-    a: Floats,
-    b: Floats,
-    c: Floats,
-    gain: Floats,
-    how: str,
-    designed_by: Callable[..., Controller],
+    law: Law, sensors: Sequence[Sensor], plant: Plant, gain: Floats, how: str, designed_by: Callable[..., Controller]
 ) -> Controller:
+    a, b, c = plant
     state = a - b @ law.gain - gain @ c
     direct = np.zeros((len(law.actuators), len(sensors)))
     name = f"{law.name} on a {how}"

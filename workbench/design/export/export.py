@@ -16,7 +16,7 @@ from workbench.design.laws.on_off import OnOffLaw
 from workbench.records.units import SI, Units
 from workbench.structure.modes import Modes
 
-LANGUAGES = {".c": "c", ".py": "python"}
+FORMATS = {".c": "c", ".py": "python", ".mat": "mat"}
 
 
 def export(
@@ -45,10 +45,11 @@ def export(
             `sample_design`.
         ValueError: another file suffix.
     """
-    kind = None if path is None else check_name(Path(path))
+    if path is not None:
+        check_name(Path(path))
     design = sample_design(modes, controller, sample_rate_hz=sample_rate_hz, computing_delay=computing_delay)
     design = replace(design, units=units)
-    if path is not None and kind is not None:
+    if path is not None:
         named = replace(design.controller, states=design.states)
         write_controller(named, path, readings=design.readings, commands=design.commands)
     return design
@@ -77,12 +78,8 @@ def write_controller(
 
 
 def check_name(path: Path) -> str:
-    """The format of a file by its suffix: "c", "python" or "mat".
-
-    Raises:
-        ValueError: another suffix, or a name that is no identifier in C or Python.
-    """
-    kind = "mat" if path.suffix == ".mat" else LANGUAGES.get(path.suffix, "")
+    """The format of a file by its suffix, "c", "python" or "mat"; the name is checked to be an identifier."""
+    kind = FORMATS.get(path.suffix, "")
     if not kind:
         raise ValueError(f"{path}: a controller is written as .c, .py or .mat; use one of these suffixes")
     name = path.stem
@@ -94,18 +91,13 @@ def check_name(path: Path) -> str:
 def _mat(controller: DigitalController, readings: tuple[str, ...], commands: tuple[str, ...]) -> dict[str, object]:
     """Variables of the MAT file: the matrices, the compensation of actuators and sensors, and what each signal is."""
     one = controller
+    compensation = ("offset", "scale", "limit", "rate", "dead_zone", "onset", "bias")
     content = {
-        "name": one.name,
-        "sample_time": one.sample_time,
-        **{letter: getattr(one, letter) for letter in "ABCDE"},
-        **{name: getattr(one, name) for name in ("offset", "scale", "limit", "rate", "dead_zone", "onset", "bias")},
+        **{name: getattr(one, name) for name in ("name", "sample_time", *"ABCDE", *compensation)},
         "readings": np.array(readings or one.sensors, object),
         "commands": np.array(commands or one.actuators, object),
         "states": np.array(one.states, object),
     }
-    if one.relays is not None:
-        content |= {"relay_allocation": one.relays.allocation, "relay_force": one.relays.force}
-        content |= {"relay_dead_band": one.relays.dead_band}
-    if one.friction is not None:
-        content |= {f"friction_{name}": getattr(one.friction, name) for name in one.friction.__dataclass_fields__}
+    for prefix, part in (("relay", one.relays), ("friction", one.friction)):
+        content |= {f"{prefix}_{name}": value for name, value in vars(part).items()} if part else {}
     return content

@@ -139,18 +139,12 @@ def sample_design(
         raise TypeError(
             f"modes must be Modes; got {type(modes).__name__}: give structure.modes(n), or the modes of a rig"
         )
-    if not isinstance(controller, Controller | Law | OnOffLaw):
-        raise TypeError(
-            f"the controller must be a law on an estimator; got {type(controller).__name__}: make one by"
-            " kalman_controller, luenberger_controller or filtered; a DigitalController is sampled already,"
-            " write_controller writes it"
-        )
     if isinstance(controller, OnOffLaw):
         raise DesignError(
             f"{controller.name} switches, and sample_design needs a linear controller; redesign(possible, law) puts it"
             " on a Kalman filter, and export of its result writes it"
         )
-    if not isinstance(controller, Controller):
+    if isinstance(controller, Law):
         raise DesignError(
             f"{controller.name} acts on modal coordinates, which no sensor reads; put it on an observer"
             " (luenberger_controller, kalman_controller) or through a modal filter first"
@@ -158,6 +152,7 @@ def sample_design(
     number(computing_delay, "computing_delay", "s")
     if not (np.isfinite(number(sample_rate_hz, "sample_rate_hz", "Hz")) and sample_rate_hz > 0):
         raise DesignError(f"the sampling rate must be positive; got {sample_rate_hz:g} Hz")
+    digital = sampled(controller, 1.0 / sample_rate_hz)
     before = close_with(modes, controller)
     if before.unstable_poles.size:
         raise DesignError(
@@ -174,22 +169,16 @@ def sample_design(
         )
 
     def poles(rate: float, delay: float) -> np.ndarray:
-        digital = sampled(controller, 1.0 / rate)
-        loop = sampled_loop(modes, controller.law.actuators, controller.sensors, digital, delay)
+        at_rate = sampled(controller, 1.0 / rate)
+        loop = sampled_loop(modes, controller.law.actuators, controller.sensors, at_rate, delay)
         return np.asarray(np.linalg.eigvals(loop))
 
     sampled_poles = poles(sample_rate_hz, computing_delay)
     if not _stable(sampled_poles):
         delay = computing_delay + max(actuator.delay for actuator in controller.law.actuators)
         raise DesignError(_too_slow(lambda rate: _stable(poles(rate, computing_delay)), sample_rate_hz, delay))
-    return SampledDesign(
-        modes,
-        controller,
-        sampled(controller, 1.0 / sample_rate_hz),
-        computing_delay,
-        sampled_poles,
-        _delay_margin(1.0 / sample_rate_hz, lambda more: _stable(poles(sample_rate_hz, computing_delay + more))),
-    )
+    margin = _delay_margin(digital.sample_time, lambda more: _stable(poles(sample_rate_hz, computing_delay + more)))
+    return SampledDesign(modes, controller, digital, computing_delay, sampled_poles, margin)
 
 
 def _stable(poles: np.ndarray) -> bool:

@@ -39,10 +39,6 @@ def sampled_loop(
         sensors: in the order of the readings, likewise.
         controller: its linear part counts.
         computing_delay: from a reading to the command's first effect, beside the actuators' own delays, s.
-
-    Raises:
-        DesignError: a sensor with a delay, or a negative delay.
-        ValueError: cross-talk from a sensor or an actuator that is not among these.
     """
     late = [sensor.name for sensor in sensors if sensor.delay]
     if late:
@@ -64,9 +60,6 @@ def held(a: Floats, b: Floats, period: float, delays: Floats) -> tuple[Floats, F
         b: (n, n_actuators).
         period: s.
         delays: (n_actuators,) of the commands, s.
-
-    Raises:
-        DesignError: delays of too many samples.
     """
     past = past_commands(delays, period)
     if past.max(initial=0) > MOST_PAST:

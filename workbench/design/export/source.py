@@ -23,12 +23,7 @@ DIGITS = 6  # of a place, to distinguish channels
 
 
 def source(
-    controller: DigitalController,
-    language: str,
-    name: str,
-    *,
-    readings: Sequence[str] = (),
-    commands: Sequence[str] = (),
+    controller: DigitalController, language: str, name: str, *, readings: Sequence[str], commands: Sequence[str]
 ) -> dict[str, str]:
     """The source of a controller, {file name: text}.
 
@@ -36,7 +31,7 @@ def source(
         controller: to write.
         language: "c" or "python".
         name: of the files and, in C, of the functions.
-        readings, commands: what each is, in words; by default the names.
+        readings, commands: what each is, in words; where empty, the names.
     """
     infinite = "INFINITY" if language == "c" else "inf"
     matrices, vectors = _numbers(controller)
@@ -48,11 +43,13 @@ def source(
         "rate": f"{1 / controller.sample_time:.6g}",
         "equations": "\n".join(_equations(matrices, vectors)),
         "signals": "\n".join(
-            [
-                *_listed("reading", readings or controller.sensors),
-                *_listed("command", commands or controller.actuators),
-                *_listed("z", controller.states or ["state of the controller"] * n_states),
-            ]
+            f"{array}[{i}]  {_plain(text)}"
+            for array, texts in (
+                ("reading", readings or controller.sensors),
+                ("command", commands or controller.actuators),
+                ("z", controller.states or ["state of the controller"] * n_states),
+            )
+            for i, text in enumerate(texts)
         ),
         "matrices": {key: _literals(values, infinite) for key, values in matrices.items()},
         "vectors": {key: _literals(values, infinite) for key, values in vectors.items()},
@@ -86,7 +83,7 @@ def _numbers(controller: DigitalController) -> tuple[dict[str, Floats], dict[str
         if len(one.A):
             matrices["SPEED_Z"] = friction.of_state
         vectors |= {"FRICTION": friction.force, "SMOOTHING": friction.smoothing}
-    vectors |= {name: limit for name, limit in (("LIMIT", one.limit), ("RATE", one.rate)) if np.isfinite(limit).any()}
+    vectors |= {name: most for name, most in (("LIMIT", one.limit), ("RATE", one.rate)) if np.isfinite(most).any()}
     if one.dead_zone.any():
         vectors |= {"DEAD_ZONE": one.dead_zone, "ONSET": one.onset}
     if one.bias.any():
@@ -135,10 +132,6 @@ def command_words(domain: Domain, actuators: Sequence[Actuator], units: Units = 
         else f"{a.name}: command at {domain.text(a.at, DIGITS)}, {a.gain:.{DIGITS}g} {unit} per unit"
         for a, unit in ((a, units.named(force_unit(a))) for a in actuators)
     )
-
-
-def _listed(array: str, words: Sequence[str]) -> list[str]:
-    return [f"{array}[{i}]  {_plain(text)}" for i, text in enumerate(words)]
 
 
 def _plain(text: str) -> str:

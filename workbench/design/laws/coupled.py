@@ -59,16 +59,13 @@ def coupled_lqr(
     r = positive_definite(weight, size, "the control weight")
     # commands scaled to equal cost: one in other units would make R look singular
     unit = np.sqrt(np.diag(r).max() / np.diag(r))
+    own = f"modes {[r + 1 for r in index]}"
     try:
         scaled_gain, _, poles = control.lqr(a, b[states] * unit, np.eye(len(states)), r * np.outer(unit, unit))
     except (np.linalg.LinAlgError, ValueError, control.ControlSlycot) as error:
-        raise DesignError(
-            f"no regulator stabilises modes {[i + 1 for i in index]} from these places: {error}"
-        ) from error
+        raise DesignError(f"no regulator stabilises {own} from these places: {error}") from error
     if not (np.real(poles) < -ON_AXIS * np.abs(poles).max()).all():
-        raise DesignError(
-            f"modes {[i + 1 for i in index]} cannot all be stabilised from these places; move an actuator"
-        )
+        raise DesignError(f"{own} cannot all be stabilised from these places; move an actuator")
     gain = np.zeros((size, 2 * omega.size))
     gain[:, states] = unit[:, None] * scaled_gain * scale
     return Law(gain, index, actuators, "coupled LQR", partial(coupled_lqr, weight=weight))

@@ -4,7 +4,7 @@ Meirovitch & Baruh; dissertation section 5.2. Mode r is controlled by the modal 
 actuators by F = B⁺ f, B the participation of the controlled modes.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -17,7 +17,7 @@ from workbench.structure.modes import Modes
 
 
 def riccati_gains(omega: ArrayLike, weight: ArrayLike, damping: ArrayLike = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Gains (g1, g2) of each mode that minimise ∫ (q'² + ω² q² + R f²) dt, in closed form.
+    """Gains g1, 1/s², and g2, 1/s, (n_modes,) each, that minimise ∫ (q'² + ω² q² + R f²) dt of each mode.
 
     g1 = -ω² + sqrt(ω⁴ + ω²/R), g2 = -c + sqrt(c² + 1/R + 2 g1); (5.55), (5.64) corrected, with modal damping c.
     g1 is evaluated as (ω²/R) / (ω² + sqrt(ω⁴ + ω²/R)), which does not cancel.
@@ -26,12 +26,6 @@ def riccati_gains(omega: ArrayLike, weight: ArrayLike, damping: ArrayLike = 0.0)
         omega: (n_modes,) natural frequencies, rad/s.
         weight: R, scalar or (n_modes,); positive.
         damping: c_r = 2 ζ_r ω_r, scalar or (n_modes,), 1/s.
-
-    Returns:
-        g1 (n_modes,) in 1/s² and g2 (n_modes,) in 1/s.
-
-    Raises:
-        DesignError: a weight that is not positive, or others than one per mode.
     """
     if np.ndim(omega) and np.size(weight) not in (1, np.size(omega)):
         raise DesignError(
@@ -60,12 +54,9 @@ def riccati_matrices(omega: ArrayLike, weight: ArrayLike, damping: ArrayLike = 0
 
 
 def pole_gains(omega: ArrayLike, poles: ArrayLike, damping: ArrayLike = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Gains (g1, g2) that put each mode's poles at `poles` (n_modes,), one of each conjugate pair, rad/s.
+    """Gains (g1, g2) that put each mode's poles at `poles` (n_modes,), one of each stable conjugate pair, rad/s.
 
     s² + (c + g2) s + ω² + g1 = (s - p)(s - p*).
-
-    Raises:
-        DesignError: a pole that is not in the open left half plane.
     """
     omega, poles = np.asarray(omega, float), np.asarray(poles, complex)
     if poles.shape != omega.shape:
@@ -88,7 +79,8 @@ def imsc(modes: Modes, controlled: int | Sequence[int], actuators: Sequence[Actu
     index = controlled_indices(modes, controlled)
     c = np.diag(modes.damping)[list(index)]
     g1, g2 = riccati_gains(modes.omega[list(index)], weight, c)
-    return _law(modes, index, actuators, (np.diag(g1), np.diag(g2)), "IMSC", partial(imsc, weight=weight))
+    gain = _shared(modes, index, actuators, np.diag(g1), np.diag(g2))
+    return Law(gain, index, tuple(actuators), "IMSC", partial(imsc, weight=weight))
 
 
 def imsc_poles(
@@ -100,17 +92,10 @@ def imsc_poles(
     """
     index = controlled_indices(modes, controlled)
     g1, g2 = pole_gains(modes.omega[list(index)], poles)
-    gains = np.diag(g1), np.diag(g2) - modes.damping[np.ix_(index, index)]
-    return _law(modes, index, actuators, gains, "IMSC poles", partial(imsc_poles, poles=poles))
+    gain = _shared(modes, index, actuators, np.diag(g1), np.diag(g2) - modes.damping[np.ix_(index, index)])
+    return Law(gain, index, tuple(actuators), "IMSC poles", partial(imsc_poles, poles=poles))
 
 
-def _law(
-    modes: Modes,
-    index: tuple[int, ...],
-    actuators: Sequence[Actuator],
-    gains: Sequence[Floats],
-    name: str,
-    designed_by: Callable[..., Law],
-) -> Law:
-    pseudo_inverse = np.linalg.pinv(participation(modes, index, actuators))
-    return Law(pseudo_inverse @ np.hstack(gains), index, tuple(actuators), name, designed_by)
+def _shared(modes: Modes, index: Sequence[int], actuators: Sequence[Actuator], *gains: Floats) -> Floats:
+    """K = B⁺ (G1 G2) from modal gains G (n_controlled, n_controlled)."""
+    return np.asarray(np.linalg.pinv(participation(modes, index, actuators)) @ np.hstack(gains))

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,7 +14,7 @@ from workbench.rig.sensors import Sensor
 from workbench.rig.statespace import input_matrix
 from workbench.structure.domain import Between, NamedPoints, Patch, Rectangle, reach
 from workbench.structure.modes import Modes, freeze
-from workbench.structure.printed import Printed, place_text
+from workbench.structure.printed import Printed, counted, place_text
 
 SINGULAR = 1e8  # condition number of B above which it counts as singular
 UNMOVED = 1e-9  # of an actuator's largest participation in a mode: below, it does not move the mode
@@ -38,8 +39,7 @@ class Law(Printed):
 
     Raises:
         TypeError: a controlled mode that is no number.
-        ValueError: a gain of another shape, or that is not finite; no controlled mode, or one that is negative, no
-            whole number, or named twice.
+        ValueError: a gain of another shape or not finite, or controlled modes that are not distinct whole numbers.
     """
 
     gain: np.ndarray
@@ -53,11 +53,9 @@ class Law(Printed):
         index = tuple(whole(r, "each of Law.controlled, a mode counted from zero,") for r in self.controlled)
         object.__setattr__(self, "controlled", index)
         object.__setattr__(self, "actuators", tuple(self.actuators))
-        expected = (len(self.actuators), 2 * len(self.controlled))
-        if self.gain.shape != expected:
-            raise ValueError(
-                f"Law.gain must have shape (n_actuators, 2 n_controlled) = {expected}; got {self.gain.shape}"
-            )
+        shape, expected = self.gain.shape, (len(self.actuators), 2 * len(self.controlled))
+        if shape != expected:
+            raise ValueError(f"Law.gain must have shape (n_actuators, 2 n_controlled) = {expected}; got {shape}")
         if not np.isfinite(self.gain).all():
             raise ValueError(f"Law.gain must be finite; got {self.gain[~np.isfinite(self.gain)][0]}")
         if not index or len(set(index)) != len(index):
@@ -68,9 +66,8 @@ class Law(Printed):
         return len(self.controlled)
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
-        count, several = len(self.actuators), self.n_controlled > 1
-        line = f"{self.name}, u = -K x: mode{'s' * several} {numbered(self.controlled)} by {count} actuator"
-        line += "s" * (count > 1)
+        line = f"{self.name}, u = -K x: mode{'s' * (self.n_controlled > 1)} {numbered(self.controlled)} by"
+        line += f" {counted(len(self.actuators), 'actuator')}"
         modes = [str(r + 1) for r in self.controlled]
         place = "at" if isinstance(self.actuators[0].at, str) else "position [m]"
         headings = ["actuator", place, *(f"q{r}" for r in modes), *(f"q{r}'" for r in modes)]
@@ -82,11 +79,7 @@ class Law(Printed):
 
 
 def linear(law: object) -> Law:
-    """The law, checked to have a gain K.
-
-    Raises:
-        DesignError: a law without one, as of on-off control.
-    """
+    """The law, checked to have a gain K, which on-off control does not."""
     if not isinstance(law, Law):
         raise DesignError(
             f"a law u = -K x is needed here, from imsc, imsc_poles, coupled_lqr or coupled_poles; got"
@@ -96,39 +89,26 @@ def linear(law: object) -> Law:
 
 
 def positive_definite(value: ArrayLike, size: int, what: str) -> np.ndarray:
-    """A number, a diagonal (size,) or a matrix (size, size) as a matrix.
-
-    Raises:
-        DesignError: a value that is not symmetric and positive definite; the message says what it is, `what`.
-    """
+    """A number, a diagonal (size,) or a matrix (size, size), `what` in words, as a positive definite matrix."""
     given = np.asarray(value, float)
     matrix = given * np.eye(size) if given.ndim == 0 else np.diag(given) if given.ndim == 1 else given
     fits = matrix.shape == (size, size) and np.isfinite(matrix).all()
     if not fits or not np.allclose(matrix, matrix.T) or not (np.linalg.eigvalsh(matrix) > 0).all():
-        several = (
-            f", {size} positive numbers or a symmetric positive definite {size} x {size} matrix" if size > 1 else ""
-        )
+        several = f", {size} positive numbers or a symmetric positive definite {size} x {size} matrix" * (size > 1)
         raise DesignError(f"{what} must be a positive number{several}; got {given}")
     return matrix
 
 
 def controlled_indices(modes: Modes, controlled: int | Sequence[int]) -> tuple[int, ...]:
-    """Zero-based indices from a count of lowest modes or a list.
-
-    Raises:
-        DesignError: modes that are not there, or named twice.
-    """
-    if isinstance(controlled, np.integer):
-        controlled = int(controlled)
-    if isinstance(controlled, int) and not 1 <= controlled <= modes.n_modes:
-        raise DesignError(
-            f"the number of controlled modes is 1 to {modes.n_modes}, those of the model; got {controlled}"
-        )
-    index = tuple(int(r) for r in (range(controlled) if isinstance(controlled, int) else controlled))
-    if not index or len(set(index)) != len(index) or min(index) < 0 or max(index) >= modes.n_modes:
-        raise DesignError(
-            f"controlled modes {list(index)} are not distinct modes of the {modes.n_modes} at hand (from 0)"
-        )
+    """Zero-based indices from a count of lowest modes or a list, checked to be distinct modes of the structure."""
+    n = modes.n_modes
+    if isinstance(controlled, int | np.integer):
+        if not 1 <= controlled <= n:
+            raise DesignError(f"the number of controlled modes is 1 to {n}, those of the model; got {controlled}")
+        return tuple(range(controlled))
+    index = tuple(map(int, controlled))
+    if not index or len(set(index)) != len(index) or min(index) < 0 or max(index) >= n:
+        raise DesignError(f"controlled modes {list(index)} are not distinct modes of the {n} at hand (from 0)")
     return index
 
 
@@ -141,12 +121,7 @@ def weighed_states(omega: Floats) -> Integers:
 
 
 def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[Actuator]) -> np.ndarray:
-    """B of the controlled modes, (n_controlled, n_actuators), checked to be of full row rank.
-
-    Raises:
-        DesignError: more modes than actuators, a mode that no actuator moves, or a singular B, as of two actuators at
-            one place.
-    """
+    """B of the controlled modes, (n_controlled, n_actuators), checked to be of full row rank."""
     actuators = tuple(actuators)
     if len(controlled) > len(actuators):
         raise DesignError(
@@ -158,14 +133,13 @@ def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[A
     if condition <= SINGULAR:
         return b
     text = modes.domain.text
-    for i, first in enumerate(actuators):
-        for second in actuators[i + 1 :]:
-            alike = (first.quantity, first.direction) == (second.quantity, second.direction)
-            if alike and separation(modes, first, second) <= 1e-6:
-                raise DesignError(
-                    f"actuators {first.name} and {second.name} are both at {text(first.at)}, so B is singular;"
-                    " move one by more than 1e-6 of the length"
-                )
+    for first, second in combinations(actuators, 2):
+        alike = (first.quantity, first.direction) == (second.quantity, second.direction)
+        if alike and separation(modes, first, second) <= 1e-6:
+            raise DesignError(
+                f"actuators {first.name} and {second.name} are both at {text(first.at)}, so B is singular;"
+                " move one by more than 1e-6 of the length"
+            )
     raise DesignError(
         f"B of the controlled modes is singular (condition {condition:.2g}): the actuators at"
         f" {', '.join(text(a.at) for a in actuators)} cannot control modes {[r + 1 for r in controlled]}"
@@ -182,11 +156,7 @@ def separation(modes: Modes, first: Actuator | Sensor, second: Actuator | Sensor
 
 
 def controllable_input(modes: Modes, controlled: Sequence[int], actuators: Sequence[Actuator]) -> np.ndarray:
-    """B of the controlled modes, (n_controlled, n_actuators), where some actuator moves each.
-
-    Raises:
-        DesignError: no actuators, or a mode at whose nodes all of them stand.
-    """
+    """B of the controlled modes, (n_controlled, n_actuators), checked that some actuator moves each."""
     return _inputs(modes, controlled, actuators)[0]
 
 
@@ -211,20 +181,18 @@ def _inputs(modes: Modes, controlled: Sequence[int], actuators: Sequence[Actuato
 
 def _largest_participation(modes: Modes, actuator: Actuator) -> Floats:
     """The largest participation of each mode (n_modes,) in an actuator's command, over all places."""
-    moment = actuator.quantity == "moment"
-    if isinstance(modes.domain, NamedPoints):
-        shapes = modes.phi(modes.domain.rotations() if moment else modes.domain.grid())
-    elif isinstance(modes.domain, Rectangle) and isinstance(actuator.at, Patch):
-        low, high = reach(modes.domain, actuator.at)
-        middles = np.clip(modes.domain.grid(PER_SIDE), low, high)
-        sides = np.broadcast_to(actuator.at[2:], middles.shape)
-        shapes = modes.edge_slopes(np.hstack([middles, sides]), direction=actuator.direction)
-    elif isinstance(modes.domain, Rectangle):
-        shapes = modes.phi(modes.domain.grid(PER_SIDE), int(moment), direction=actuator.direction)
+    domain, moment = modes.domain, actuator.quantity == "moment"
+    if isinstance(domain, NamedPoints):
+        shapes = modes.phi(domain.rotations() if moment else domain.grid())
+    elif isinstance(domain, Rectangle) and isinstance(actuator.at, Patch):
+        middles = np.clip(domain.grid(PER_SIDE), *reach(domain, actuator.at))
+        patches = np.hstack([middles, np.broadcast_to(actuator.at[2:], middles.shape)])
+        shapes = modes.edge_slopes(patches, direction=actuator.direction)
+    elif isinstance(domain, Rectangle):
+        shapes = modes.phi(domain.grid(PER_SIDE), int(moment), direction=actuator.direction)
     else:
         shapes = modes.phi(np.linspace(0.0, modes.length, 8 * modes.n_modes + 9), int(moment))
-    most: Floats = abs(actuator.gain) * np.abs(shapes).max(axis=0)
-    return most
+    return np.asarray(abs(actuator.gain) * np.abs(shapes).max(axis=0))
 
 
 def numbered(indices: Sequence[int]) -> str:

@@ -90,23 +90,18 @@ def on_off(
         )
     n = len(index)
     values = []
-    for name, value, least in (
-        ("force", force, "positive"),
-        ("dead_band", dead_band, "0 or more"),
-        ("slope", slope, "0 or more"),
-    ):
+    for name, value in (("force", force), ("dead_band", dead_band), ("slope", slope)):
         value = np.asarray(value, float)
         if value.shape not in ((), (1,), (n,)):
             raise DesignError(f"on-off {name} is one number, or one per controlled mode, {n}; got {value.size}")
         value = np.broadcast_to(value, n)
-        if not np.isfinite(value).all() or (value < 0).any() or (least == "positive" and not value.all()):
+        if not np.isfinite(value).all() or (value < 0).any() or (name == "force" and not value.all()):
+            least = "positive" if name == "force" else "0 or more"
             raise DesignError(f"on-off {name} must be {least}; got {value.min():g}")
         values.append(value)
-    c = np.diag(modes.damping)
-    relays = tuple(
-        Relay(float(modes.omega[r]), float(c[r]), float(k), float(d), float(s))
-        for r, k, d, s in zip(index, *values, strict=True)
-    )
+    own = list(index)
+    rows = zip(modes.omega[own], np.diag(modes.damping)[own], *values, strict=True)
+    relays = tuple(Relay(*map(float, row)) for row in rows)
     allocation = np.linalg.pinv(participation(modes, index, actuators))
     again = partial(on_off, force=force, dead_band=dead_band, slope=slope)
     return OnOffLaw(relays, allocation, index, tuple(actuators), designed_by=again)

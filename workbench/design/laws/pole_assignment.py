@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from workbench.design.laws.law import DesignError
 
 ILL_CONDITIONED = 1e12  # condition number of X above which the poles count as not assignable
-STAYS = 1e-12  # of the pole: nearer to an open-loop pole it coincides with it, nearer to the real axis it is real
+COINCIDES = 1e-12  # of the pole: nearer to an open-loop pole it coincides with it, nearer to the real axis it is real
 
 
 def assign(a: np.ndarray, b: np.ndarray, poles: ArrayLike, directions: np.ndarray, names: Sequence[str]) -> np.ndarray:
@@ -25,9 +25,6 @@ def assign(a: np.ndarray, b: np.ndarray, poles: ArrayLike, directions: np.ndarra
         poles: (n,) one of each conjugate pair, rad/s, off the real axis; the r-th replaces that of the r-th mode.
         directions: (n_inputs, n) complex, the input that acts best on each mode.
         names: of the modes, for refusals.
-
-    Raises:
-        DesignError: poles of the wrong number, unstable, real, at another mode's open-loop pole, or not assignable.
     """
     n = a.shape[0] // 2
     poles = np.asarray(poles, complex)
@@ -36,13 +33,13 @@ def assign(a: np.ndarray, b: np.ndarray, poles: ArrayLike, directions: np.ndarra
     for pole, name in zip(poles, names, strict=True):
         if not pole.real < 0:
             raise DesignError(f"pole {pole:.4g} of {name} is not stable: its real part must be negative")
-        if abs(pole.imag) <= STAYS * abs(pole):
+        if abs(pole.imag) <= COINCIDES * abs(pole):
             raise DesignError(
                 f"pole {pole.real:.4g} of {name} is real; give one of a conjugate pair, off the real axis"
             )
     inputs = np.array(directions, complex)
     vectors, determinants = _resolvents(a, poles, b @ inputs)
-    coincides = np.abs(determinants) <= STAYS * np.abs(poles) ** 2
+    coincides = np.abs(determinants) <= COINCIDES * np.abs(poles) ** 2
     for r, mode in zip(*np.nonzero(coincides.T), strict=True):
         if r != mode:
             raise DesignError(
@@ -68,8 +65,7 @@ def _resolvents(a: np.ndarray, poles: np.ndarray, forcing: np.ndarray) -> tuple[
     n = a.shape[0] // 2
     qq, qv, vq, vv = (np.diag(block)[:, None] for block in (a[:n, :n], a[:n, n:], a[n:, :n], a[n:, n:]))
     determinants = (poles - qq) * (poles - vv) - qv * vq
-    uncoupled = all(np.count_nonzero(block - np.diag(np.diag(block))) == 0 for block in (a[n:, n:], a[n:, :n]))
-    if uncoupled:
+    if not any((block - np.diag(np.diag(block))).any() for block in (a[n:, n:], a[n:, :n])):  # uncoupled modes
         upper, lower = forcing[:n], forcing[n:]
         with np.errstate(divide="ignore", invalid="ignore"):
             q = ((poles - vv) * upper + qv * lower) / determinants

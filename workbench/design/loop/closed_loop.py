@@ -107,11 +107,9 @@ class ClosedLoop(Printed):
     @property
     def stability_text(self) -> str:
         """Stability, with the decay or growth rate."""
-        rate = {
-            "stable": f", decay rate {self.decay_rate:.3g} 1/s",
-            "unstable": f", growth rate {-self.decay_rate:.3g} 1/s",
-        }
-        return self.stability + rate.get(self.stability, "")
+        rate = self.decay_rate
+        texts = {"stable": f", decay rate {rate:.3g} 1/s", "unstable": f", growth rate {-rate:.3g} 1/s"}
+        return self.stability + texts.get(self.stability, "")
 
     @property
     def stable(self) -> bool:
@@ -272,24 +270,20 @@ def _in_former_order(function: Callable[P, Response]) -> Callable[P, Response]:
     def former(loop: ClosedLoop, state: Any, time: Any) -> tuple[ClosedLoop, Any, Any]:
         return loop, time, state
 
-    def is_former(loop: ClosedLoop, timepts: Any, initial_state: Any) -> bool:
-        """Whether the arguments are (loop, state, time): they make sense in that order alone."""
-        sizes = ((2 * loop.modes.n_modes,), loop.matrix.shape[:1])
+    def fits(loop: ClosedLoop, times: Any, state: Any) -> bool:
+        """Whether these may be instants and a state."""
+        rise = np.ndim(times) == 1 and np.size(times) and np.min(times) >= 0 and (np.diff(times) > 0).all()
+        return bool(rise and np.shape(state) in ((2 * loop.modes.n_modes,), loop.matrix.shape[:1]))
 
-        def fits(times: Any, state: Any) -> bool:
-            rise = np.ndim(times) == 1 and np.size(times) and np.min(times) >= 0 and (np.diff(times) > 0).all()
-            return bool(rise and np.shape(state) in sizes)
-
-        if fits(timepts, initial_state) and fits(initial_state, timepts):
+    @wraps(function)
+    def with_former(*args: Any, **kwargs: Any) -> Response:
+        by_order = len(args) == 3 and not kwargs and fits(*former(*args))
+        if by_order and fits(*args):
             raise ValueError(
                 "either argument may be the instants and either the state, and their order has changed; name them:"
                 " initial_response(loop, timepts=..., initial_state=...)"
             )
-        return fits(initial_state, timepts)
-
-    @wraps(function)
-    def with_former(*args: Any, **kwargs: Any) -> Response:
-        if kwargs.keys() & {"state", "time"} or (len(args) == 3 and not kwargs and is_former(*args)):
+        if by_order or kwargs.keys() & {"state", "time"}:
             now = "initial_response(loop, state, time) is now initial_response(loop, timepts, initial_state)"
             warn(f"{now}; the old order goes with the next version", DeprecationWarning, 2)
             args, kwargs = former(*args, **kwargs), {}
@@ -325,7 +319,7 @@ def initial_response(
     if modal is None:
         modal = _stepped(loop.matrix, state, time)
     modal.flags.writeable = False  # so that `Response` does not copy a large array
-    motion = modal if modal.shape[0] == 2 * loop.modes.n_modes else modal[: 2 * loop.modes.n_modes]
+    motion = modal if len(modal) == sizes[0] else modal[: sizes[0]]
     fed_back = np.flatnonzero(loop.feedback.any(axis=0))
     return Response(time, motion, loop.feedback[:, fed_back] @ modal[fed_back], loop.modes)
 
@@ -348,19 +342,8 @@ def peak_force(loop: ClosedLoop, state: np.ndarray, final_time: float) -> float:
     return largest(poles, amplitudes, final_time)
 
 
-def _controlled_alone(loop: ClosedLoop) -> bool:
-    """Whether the controlled modes move independently of the others: exact modal coordinates, proportional damping."""
-    others = np.setdiff1d(np.arange(loop.modes.n_modes), loop.law.controlled)
-    uncoupled = loop.matrix.shape[0] == 2 * loop.modes.n_modes and loop.modes.proportional
-    return uncoupled and not loop.feedback[:, np.r_[others, loop.modes.n_modes + others]].any()
-
-
 def checked_times(time: ArrayLike) -> Floats:
-    """Instants (n_times,) as an array.
-
-    Raises:
-        ValueError: times that do not increase from zero or later.
-    """
+    """Instants (n_times,) as an array, checked to increase from zero or later."""
     times = np.asarray(time, float)
     if times.ndim != 1 or times.size == 0 or (np.diff(times) <= 0).any() or times[0] < 0:
         raise ValueError("times must increase, from zero or later")
@@ -389,14 +372,16 @@ def _stepped(matrix: np.ndarray, state: np.ndarray, time: np.ndarray) -> np.ndar
 def _cascade(loop: ClosedLoop, state: np.ndarray, time: np.ndarray) -> np.ndarray | None:
     """e^{At} x0 (2 n_modes, n_times) in closed form where only controlled modes are fed back; None elsewhere.
 
-    The controlled modes then drive each residual mode by itself. With z = q' - p* q of a residual mode, z' = p z + g,
-    and g = Σ_k g_k e^{λ_k t} of the controlled loop, z = e^{pt} z0 + Σ_k g_k (e^{λ_k t} - e^{pt}) / (λ_k - p).
+    With exact modal coordinates and proportional damping the controlled modes drive each residual mode by itself. With
+    z = q' - p* q of a residual mode, z' = p z + g, and g = Σ_k g_k e^{λ_k t} of the controlled loop,
+    z = e^{pt} z0 + Σ_k g_k (e^{λ_k t} - e^{pt}) / (λ_k - p).
     """
     modes, n = loop.modes, loop.modes.n_modes
     own = [*loop.law.controlled, *(n + r for r in loop.law.controlled)]
     rest = np.setdiff1d(np.arange(n), loop.law.controlled)
     c = np.diag(modes.damping)
-    if not _controlled_alone(loop) or not (modes.omega[rest] > 0.5 * c[rest]).all():
+    exact = len(loop.matrix) == 2 * n and not loop.feedback[:, np.r_[rest, n + rest]].any()
+    if not (exact and modes.proportional and (modes.omega[rest] > 0.5 * c[rest]).all()):
         return None
     values, vectors = np.linalg.eig(loop.matrix[np.ix_(own, own)])
     if not np.linalg.cond(vectors) < WELL_CONDITIONED:

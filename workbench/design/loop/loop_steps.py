@@ -48,30 +48,30 @@ def _commands(
     controller: ControllerArrays, k: int, reading: Floats, z: Floats, z_next: Floats, v: Floats, command: Floats
 ) -> None:
     """One step of a `DigitalController` at sample k: fill its commands, v and next state z."""
-    (a, b, c, d, e), (offset, scale, limit, rate, dead, bias), (allocation, on, band), (push, cf, df, force, smooth) = (
-        controller
-    )
+    (a, b, c, d, e), (offset, scale, limit, rate, dead_zone, bias), relays, friction = controller
+    allocation, on_force, dead_band = relays
+    friction_gain, c_speed, d_speed, friction_force, smoothing = friction
     nu = limit.size
     y = scale * (reading - offset)
     w = np.zeros(nu)
     for i in range(c.shape[0]):
         s = _row(c, d, i, z, y)
-        if on.size > 0:
-            if abs(s) > band[i]:
+        if on_force.size > 0:
+            if abs(s) > dead_band[i]:
                 for j in range(nu):
-                    w[j] -= allocation[j, i] * math.copysign(on[i], s)
+                    w[j] -= allocation[j, i] * math.copysign(on_force[i], s)
         else:
             w[i] = s
-    for i in range(force.size):
-        s = _row(cf, df, i, z, y)
+    for i in range(friction_force.size):
+        speed = _row(c_speed, d_speed, i, z, y)
         for j in range(nu):
-            w[j] += push[j, i] * force[i] * math.tanh(s / smooth[i])
+            w[j] += friction_gain[j, i] * friction_force[i] * math.tanh(speed / smoothing[i])
     for j in range(nu):
         held = min(max(w[j], -limit[j]), limit[j])
         held = min(max(held, v[j] - rate[j]), v[j] + rate[j])
         v[j] = held
-        onset = min(max(held / (ONSET * dead[j]), -1.0), 1.0) if dead[j] > 0.0 else 0.0
-        command[j, k] = held + dead[j] * onset - bias[j]
+        onset = min(max(held / (ONSET * dead_zone[j]), -1.0), 1.0) if dead_zone[j] > 0.0 else 0.0
+        command[j, k] = held + dead_zone[j] * onset - bias[j]
     for i in range(z.size):
         z_next[i] = _row(a, b, i, z, y)
         for m in range(nu):
@@ -86,7 +86,7 @@ def loop_record(
     elements: Elements,
     drive: Floats,
     mix: Floats,
-    into: Floats,
+    participation: Floats,
     sense: Floats,
     seen: Floats,
     noise: Floats,
@@ -106,7 +106,7 @@ def loop_record(
             hysteresis.
         mix: (n_actuators, n_actuators) command that each actuator takes per command sent, its cross-talk; (0, 0) for
             none.
-        into: (n, n_actuators) participation factors.
+        participation: (n, n_actuators) modal forces per force.
         sense: (n_sensors, 7) gain, bias, drift per sample, delay, time constant, limit, step.
         seen: (2, n_sensors, n) output matrices of displacements and of velocities, with cross-talk.
         noise: (n_sensors, n_samples).
@@ -120,7 +120,7 @@ def loop_record(
     omega, damping, coupling, stiffening, stretch, stretching, drag_shapes, drag_weights = structure
     kinds, shapes, _ = elements
     q_out, v_out, f_out, u_out, ew, ev, ef = out
-    n_modes, n_el, nu, ny = into.shape[0], kinds.size, drive.shape[0], sense.shape[0]
+    n_modes, n_el, nu, ny = participation.shape[0], kinds.size, drive.shape[0], sense.shape[0]
     n_samples, h = noise.shape[1], dt / n_sub
     n_dis = disturbance.shape[0]
     linear, finely, drives, motion, points, work, kept = at_rest(LANES * (omega.size // LANES), n_el)
@@ -202,7 +202,7 @@ def loop_record(
                 force += drive[j, 5]
                 f_out[j, k] += force / n_sub
                 for r in range(n_modes):
-                    modal[r] += into[r, j] * force
+                    modal[r] += participation[r, j] * force
             advance(linear, finely, (modal, modal, none, none), elements, along, motion, points, work, kept)
             for j in range(ny):
                 y = 0.0

@@ -47,12 +47,10 @@ def respond_on_off(modes: Modes, law: OnOffLaw, state: np.ndarray, time: ArrayLi
 def switchings(modes: Modes, law: OnOffLaw, state: np.ndarray, final_time: float) -> tuple[tuple[Segment, ...], ...]:
     """The motion of each controlled mode between its switchings, up to the final time.
 
-    Raises:
-        DesignError: an actuator whose force is not its command times its gain.
+    An actuator whose force is not its command times its gain is refused.
     """
-    for actuator, most in zip(
-        law.actuators, np.abs(law.allocation) @ [relay.force for relay in law.relays], strict=True
-    ):
+    largest = np.abs(law.allocation) @ [relay.force for relay in law.relays]
+    for actuator, most in zip(law.actuators, largest, strict=True):
         _check_proportional(actuator, float(most))
     return tuple(
         switch(relay, state[r], state[modes.n_modes + r], final_time)
@@ -62,21 +60,15 @@ def switchings(modes: Modes, law: OnOffLaw, state: np.ndarray, final_time: float
 
 def _check_proportional(actuator: Actuator, largest: float) -> None:
     """Refuse an actuator whose force is not its gain times its command, for commands up to the largest."""
-    refused = {
-        "delay": actuator.delay,
-        "time_constant": actuator.time_constant,
-        "dead_zone": actuator.dead_zone,
-        "hysteresis_share": actuator.hysteresis_share,
-        "bias": actuator.bias,
-        "rate_limit": actuator.rate_limit if np.isfinite(actuator.rate_limit) else 0.0,
-        "limit": actuator.limit if actuator.limit < abs(actuator.gain) * largest * (1.0 - 1e-12) else 0.0,
-    }
-    for name, value in refused.items():
-        if value:
-            raise DesignError(
-                f"actuator {actuator.name} has {name} = {value:g}, which the exact motion of on-off control cannot"
-                " include: simulate it by verify or redesign, or leave it out of the actuator"
-            )
+    names = ("delay", "time_constant", "dead_zone", "hysteresis_share", "bias")
+    refused = [name for name in names if getattr(actuator, name)]
+    refused += ["rate_limit"] * bool(np.isfinite(actuator.rate_limit))
+    refused += ["limit"] * bool(actuator.limit < abs(actuator.gain) * largest * (1.0 - 1e-12))
+    if refused:
+        raise DesignError(
+            f"actuator {actuator.name} has {refused[0]} = {getattr(actuator, refused[0]):g}, which the exact motion of"
+            " on-off control cannot include: simulate it by verify or redesign, or leave it out of the actuator"
+        )
 
 
 def motion(
@@ -94,9 +86,8 @@ def motion(
     for j, (relay, r) in enumerate(zip(law.relays, law.controlled, strict=True)):
         driven = np.zeros((2, len(residual), 1))
         for segment in segments[j]:
-            inside = np.flatnonzero((time >= segment.start) & (time < segment.end))
-            if segment is segments[j][-1]:
-                inside = np.flatnonzero(time >= segment.start)
+            last = segment is segments[j][-1]
+            inside = np.flatnonzero((time >= segment.start) & ((time < segment.end) | last))
             tau = time[inside] - segment.start
             course = segment.steady, segment.ramp, segment.fading, relay.slope
             force[j, inside] = course[0] + course[1] * tau + course[2] * np.exp(-relay.slope * tau)

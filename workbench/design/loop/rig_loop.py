@@ -8,10 +8,11 @@ from typing import TypeVar
 import numpy as np
 
 from workbench.arguments import number, whole
+from workbench.design.estimation.controller import check_readable
 from workbench.design.estimation.digital import DigitalController
 from workbench.design.loop.closed_loop import Response
 from workbench.design.loop.loop_steps import ControllerArrays, loop_record
-from workbench.renamed import Renamed, former_arguments
+from workbench.renamed import Renamed, former_fields
 from workbench.rig.actuators import Actuator, mixing
 from workbench.rig.elements import PeriodicForce, RandomForce
 from workbench.rig.rig import Rig, participation_of, shape_of
@@ -27,6 +28,7 @@ P = TypeVar("P", Actuator, Sensor)
 K = TypeVar("K")
 
 
+@former_fields(ports="exciters")
 @dataclass(frozen=True, eq=False)
 class LoopTest:
     """The excitation of a loop from rest: an impulse, forces held over each sample, or both.
@@ -56,20 +58,18 @@ class LoopTest:
             raise ValueError(
                 f"a test needs 2 samples or more, a positive time apart; got {self.n_samples}, {self.sample_time:g} s"
             )
-        if self.forces is not None and np.shape(self.forces) != (len(self.exciters), self.n_samples):
+        if self.forces is None:
+            return
+        if np.shape(self.forces) != (len(self.exciters), self.n_samples):
             raise ValueError(
                 f"LoopTest.forces must have shape ({len(self.exciters)} exciters, {self.n_samples} samples); got"
                 f" {np.shape(self.forces)}. Is time last?"
             )
-        if self.forces is not None:
-            freeze(self, "forces")
+        freeze(self, "forces")
 
     @property
     def time(self) -> np.ndarray:
         return self.sample_time * np.arange(self.n_samples)
-
-
-LoopTest.__init__ = former_arguments(ports="exciters")(LoopTest.__init__)  # type: ignore[method-assign]
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,23 +81,25 @@ class LoopRun:
         commands: (n_actuators, n_samples).
         elements: (3, n_elements, n_samples) displacement, rate and force of each element at a point.
         bounded: whether the motion stayed finite to the end; the response ends before the sample at which it diverged.
-        into: (n_modes, n_actuators) participation factors, modal forces per force.
+        participation: (n_modes, n_actuators) modal forces per force.
     """
 
     response: Response
     commands: np.ndarray
     elements: np.ndarray
     bounded: bool
-    into: np.ndarray
+    participation: np.ndarray
+
+    into = Renamed("participation")
 
     def __post_init__(self) -> None:
-        freeze(self, "commands", "elements", "into")
+        freeze(self, "commands", "elements", "participation")
 
     @property
     def work(self) -> np.ndarray:
         """W_r = ∫ b_rᵀ F q_r' dt (n_modes,), by the mean force over each sample; exact for forces held over it."""
         n = self.response.modes.n_modes
-        modal = self.into @ self.response.forces[:, :-1]
+        modal = self.participation @ self.response.forces[:, :-1]
         return np.asarray((modal * np.diff(self.response.modal[:n], axis=1)).sum(axis=1))
 
     @property
@@ -127,7 +129,7 @@ def run_loop(
     modes, n = rig.modes, rig.modes.n_modes
     sensors = [named(rig.sensors, name) for name in controller.sensors]
     actuators = driven(rig, controller.actuators)
-    into = participation_of(Rig(modes, tuple(actuators), ()))
+    participation = participation_of(Rig(modes, tuple(actuators), ()))
     rng = None if test.seed is None else np.random.default_rng(test.seed)
     noise = np.zeros((len(sensors), test.n_samples))
     if rng is not None:
@@ -146,7 +148,7 @@ def run_loop(
         laws,
         np.array([_drive(a) for a in actuators]).reshape(-1, 9),
         mixing(actuators) if any(a.crosstalk for a in actuators) else np.zeros((0, 0)),
-        np.ascontiguousarray(into),
+        np.ascontiguousarray(participation),
         np.array([_sense(s, test.n_samples) for s in sensors]).reshape(-1, 7),
         _output_matrices(rig, sensors),
         noise,
@@ -161,7 +163,7 @@ def run_loop(
     q, v, f, u, *elements = out
     time = test.sample_time * np.arange(n_samples, dtype=float)
     response = Response(time, np.vstack([q, v]), f, modes)
-    return LoopRun(response, u, np.array(elements), bool(bounded), into)
+    return LoopRun(response, u, np.array(elements), bool(bounded), participation)
 
 
 def run_loops(rigs: Sequence[Rig], controller: DigitalController, test: LoopTest) -> list[LoopRun]:
@@ -180,11 +182,9 @@ def of_loops(
 
 def check_fits(rig: Rig, controller: DigitalController, test: LoopTest) -> None:
     """Refuse a controller that does not fit a rig or a test, or one that reads an accelerometer."""
-    for kind, names, there in (
-        ("sensor", controller.sensors, {s.name for s in rig.sensors}),
-        ("actuator", controller.actuators, {a.name for a in rig.actuators}),
-    ):
-        missing = [name for name in names if name not in there]
+    for kind in ("sensor", "actuator"):
+        there = {part.name for part in getattr(rig, f"{kind}s")}
+        missing = [name for name in getattr(controller, f"{kind}s") if name not in there]
         if missing:
             raise ValueError(
                 f"the controller names {kind} {missing[0]!r}, which the rig does not have: it has"
@@ -195,9 +195,7 @@ def check_fits(rig: Rig, controller: DigitalController, test: LoopTest) -> None:
             f"the controller has a sample time of {controller.sample_time:g} s and the test of {test.sample_time:g} s;"
             " give both the same"
         )
-    for name in controller.sensors:
-        if MEASURED[named(rig.sensors, name).quantity][1] > 1:
-            raise ValueError(f"sensor {name} reads acceleration; a controller here reads displacement or velocity")
+    check_readable([named(rig.sensors, name) for name in controller.sensors])
 
 
 def named(parts: Sequence[P], name: str) -> P:
@@ -208,8 +206,7 @@ def named(parts: Sequence[P], name: str) -> P:
 def driven(rig: Rig, names: Sequence[str]) -> list[Actuator]:
     """The actuators of a rig that a controller drives; cross-talk from others, which have no command, is left out.
 
-    Raises:
-        ValueError: another actuator takes a share of the command of one of them.
+    Another actuator that takes a share of the command of one of them is refused.
     """
     for actuator in rig.actuators:
         taken = [name for name, _ in actuator.crosstalk if name in names]
@@ -232,8 +229,7 @@ def _drive(a: Actuator) -> list[float]:
 
 def _sense(s: Sensor, n_samples: int) -> list[float]:
     # a negative delay, of a sensor ahead of the inputs' clock, is not causal in a loop
-    drift = s.drift / max(n_samples - 1, 1)
-    return [s.gain, s.bias, drift, max(s.delay, 0.0), s.time_constant, s.limit, s.step]
+    return [s.gain, s.bias, s.drift / (n_samples - 1), max(s.delay, 0.0), s.time_constant, s.limit, s.step]
 
 
 def _output_matrices(rig: Rig, sensors: Sequence[Sensor]) -> np.ndarray:
@@ -272,12 +268,6 @@ def _arrays(one: DigitalController) -> ControllerArrays:
         switching = (relays.allocation, relays.force, relays.dead_band)
     if friction is not None:
         forward = (friction.gain, friction.of_state, friction.of_reading, friction.force, friction.smoothing)
-    return tuple(
-        tuple(np.array(x, float, order="C") for x in group)
-        for group in (
-            (one.A, one.B, one.C, one.D, one.E),
-            (one.offset, one.scale, one.limit, one.rate, one.dead_zone, one.bias),
-            switching,
-            forward,
-        )
-    )
+    matrices, bounds = (one.A, one.B, one.C, one.D, one.E), (one.limit, one.rate, one.dead_zone, one.bias)
+    groups = (matrices, (one.offset, one.scale, *bounds), switching, forward)
+    return tuple(tuple(np.array(x, float, order="C") for x in group) for group in groups)

@@ -172,9 +172,6 @@ def _sliding(relay: Relay, start: float, end: float, q: float, v: float, edge: f
     return Segment(start, end, q, v, settled, 0.0, -_pull(relay, q, edge) - settled, True)
 
 
-# --- closed forms
-
-
 def kernels(omega: ArrayLike, c: ArrayLike, time: ArrayLike) -> tuple[Any, Any, Any, Any]:
     """h, h', ∫h and ∫∫h of q'' + c q' + ω² q = δ(t), from rest; arrays broadcast."""
     if np.ndim(omega) == 0 and np.ndim(time) == 0:

@@ -22,7 +22,7 @@ from numba import njit
 
 from workbench.arrays import Floats, Integers
 from workbench.design.placement.dual_bound import Tables, dual_bound, expanded
-from workbench.design.placement.hull_bound import HullBound
+from workbench.design.placement.hull_bound import HullTables, hull_tables, raise_to
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.small_matrices import inverse_of, multiply
 from workbench.design.placement.task import PlacementTask
@@ -34,6 +34,9 @@ SINGULAR = 1e-13  # pivot of B over its largest entry, below which B counts as s
 OF_JUMP = 26.0  # times h J / 192: largest error of a cubic at a jump J of the slope
 NO_FORCE = 1e-15  # of the largest eigenvalue of S: one below is zero to round-off, as of two rigid modes moved alike
 FLAT = 1e-12  # of the same: with an eigenvalue between, S^-½ is not reliable, and the limit is left out
+
+# half-widths, tables, T, S and S^-½ and L of the limits, the limit of the condition, f, P
+Arguments = tuple[Floats, Tables, Floats, Floats, Floats, Floats, float, Floats, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +125,7 @@ class CellBounds:
                 regular.append(acting.all())
         matrices, roots, inverses = (np.array([part[i] for part in kept]).reshape(-1, n, n) for i in range(3))
         bounded = np.array([part[3] for part in kept])
-        self._arguments = (
+        self._arguments: Arguments = (
             table.half,
             (table.value, table.slope, table.curvature, table.most_curvature, table.most_rate),
             np.array(task.roots, order="C"),  # a writeable copy: numba would compile again for a read-only array
@@ -133,40 +136,26 @@ class CellBounds:
             np.array(forces if np.isfinite(limits.peak_force) else forces[:, :0], order="C"),
             float(limits.peak_force),
         )
-        self._hull: HullBound | None = None  # it needs a limit of all of B⁻¹
+        self._hull: HullTables | None = None  # it needs a limit of all of B⁻¹
         if n > 1 and table.most_fourth is not None:
-            measures = (table.centre, table.half, table.most_fourth)
             whole = roots[regular], inverses[regular], bounded[regular]
-            self._hull = HullBound(task, measures, *whole, limits.condition)
+            self._hull = hull_tables(task, (table.centre, table.half, table.most_fourth), *whole, limits.condition)
 
     def __call__(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Lower bounds of √W_R (inf: no placement meets the limits), √W_R at the centres, and the axes to halve."""
         lower, work = np.empty(len(cells)), np.empty(len(cells))
         axis = np.empty(len(cells), np.int64)
-        _bounds(cells, *self._arguments, lower, work, axis)
+        _bounds(cells, self._arguments, lower, work, axis)
         for j in reversed(range(cells.shape[1] - 1)):  # halve an interval of two actuators first, to separate them
             axis[cells[:, j] == cells[:, j + 1]] = j
         if self._hull is not None and self.wanted > 0:
-            self._hull.raise_to(self.wanted, cells, lower)
+            raise_to(self.wanted, cells, self._hull, lower)
         return lower, work, axis
 
 
 @njit(cache=True, nogil=True)
-def _bounds(
-    cells: Integers,
-    halves: Floats,
-    tables: Tables,
-    transforms: Floats,
-    squares: Floats,
-    inverses: Floats,
-    limits: Floats,
-    condition: float,
-    forces: Floats,
-    peak: float,
-    lower: Floats,
-    work: Floats,
-    axis: Integers,
-) -> None:
+def _bounds(cells: Integers, arguments: Arguments, lower: Floats, work: Floats, axis: Integers) -> None:
+    halves, tables, transforms, squares, inverses, limits, condition, forces, peak = arguments
     value, slope, _, most_curvature, _ = tables
     n_cells, n = cells.shape
     h, score = np.empty(n), np.empty(n)
@@ -204,19 +193,12 @@ def _series_bound(
 ) -> tuple[float, float]:
     """Lower bound of √W_R in a cell and its value at the centre; -inf and inf where Neumann's series may diverge.
 
-    The bound is inf where no placement keeps the limit of the peak force.
-
-    Args:
-        node, h: (n,) intervals and their half-widths.
-        tables: of the shapes on all intervals.
-        transforms: T (n_residual, n, n_columns).
-        forces, peak: f (n, n_instants) and P.
-        score: (n,) set to how much the width of each interval weakens the bound.
+    The bound is inf where no placement keeps the limit P of the peak force under the modal forces f (n, n_instants).
     """
     value = tables[0]
     n_residual, n, n_columns = transforms.shape
     matrix, m, change = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
-    neumann, error, most = np.empty((n, n)), np.empty((n, n)), np.empty(n)
+    neumann, error, most = np.empty((n, n)), np.empty((n, n)), np.ones(n)
     largest = 0.0
     for j in range(n):
         score[j] = h[j]
@@ -227,8 +209,6 @@ def _series_bound(
         return -np.inf, np.inf
 
     # change of the forces over the cell: E = M ΔB
-    for i in range(n):
-        most[i] = 1.0
     for j in range(n):
         score[j] = 0.0
         for i in range(n):

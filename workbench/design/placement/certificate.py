@@ -179,15 +179,10 @@ class _Search:
         for node in cells.T:
             first = np.maximum(tree.low[node], first + tree.apart)
             room &= tree.high[node] >= first
-        feasible: Integers = cells[room]
-        return feasible
+        return np.asarray(cells[room])
 
     def _halved(self, rows: np.ndarray) -> np.ndarray:
-        """Both halves of each cell along its axis.
-
-        Args:
-            rows: (n_cells, n_actuators + 2) nodes, lower bound, and axis to halve.
-        """
+        """Both halves of each cell, from rows (n_cells, n_actuators + 2) of nodes, lower bound, and axis to halve."""
         left = rows[:, :-2].astype(np.int64)
         halved = np.arange(len(left)), rows[:, -1].astype(np.int64)
         left[halved] = 2 * left[halved] + 1
@@ -202,8 +197,7 @@ class _Search:
         self.cells += len(cells)
         parts = np.array_split(cells, min(workers, 1 + len(cells) // 1000))
         lower, work, axis = (np.concatenate(part) for part in zip(*pool.map(self._bounds, parts), strict=True))
-        better = self._better(cells, work)
-        if better is not None:
+        if (better := self._better(cells, work)) is not None:
             return better
         open_ = lower < self._wanted
         cells, lower, axis = cells[open_], lower[open_], axis[open_]
@@ -213,8 +207,7 @@ class _Search:
         axis[at_end] = cells[at_end].argmin(axis=1)
         stuck = cells.min(axis=1) >= smallest
         if stuck.any() and self._tree.kept is not None:  # single candidates, whose W_R is known
-            known = self._tree.kept(cells[stuck])
-            better = self._better(cells[stuck], np.sqrt(known))
+            better = self._better(cells[stuck], np.sqrt(self._tree.kept(cells[stuck])))
             if better is not None:
                 return better
         elif stuck.any():
@@ -230,13 +223,9 @@ class _Search:
     def _better(self, cells: Integers, work: Floats) -> Floats | None:
         """Places at the centre of a cell that improve on the placement by more than the gap; None where none do."""
         for i in np.argsort(work)[:TRIED]:
-            if not work[i] < self._wanted:
-                break
-            places = self._tree.places(cells[i])
-            if places is None:
-                continue
-            placement = self._task.placed(places, "")
-            if placement.residual_work < self._wanted**2 and self._limits.satisfied_by(placement):
+            places = self._tree.places(cells[i]) if work[i] < self._wanted else None
+            placement = None if places is None else self._task.placed(places, "")
+            if placement and placement.residual_work < self._wanted**2 and self._limits.satisfied_by(placement):
                 return placement.positions
         return None
 

@@ -103,12 +103,6 @@ def controlled_mode_count(
     if not np.isfinite(remaining).any():
         raise DesignError("no number of modes can be controlled from these places; give others")
     sufficient = counts[remaining <= share * energy.sum()]
-    return ControlledModeCount(
-        counts,
-        energy,
-        uncontrolled,
-        residual_work,
-        efforts,
-        int(sufficient[0]) if sufficient.size else None,
-        int(counts[np.nanargmin(remaining)]),
-    )
+    recommended = int(sufficient[0]) if sufficient.size else None
+    least = int(counts[np.nanargmin(remaining)])
+    return ControlledModeCount(counts, energy, uncontrolled, residual_work, efforts, recommended, least)

@@ -4,7 +4,8 @@ W_R = ½ Σ_r |b_rᵀ F(iω_r)|² with F(s) = -K (s - A + B K)⁻¹ x0. Many des
 eigenvectors and eigenvalues (X1, X2, Λ) of the Hamiltonian: F(t) = -R⁻¹ Bᵀ X2 e^{Λt} X1⁻¹ x0.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,8 +15,10 @@ from scipy.optimize import OptimizeResult, minimize
 from workbench.arrays import Floats, Integers
 from workbench.design.laws.law import DesignError, Law, weighed_states
 from workbench.design.loop.peak import largest
-from workbench.design.placement.limits import Limits
-from workbench.design.placement.task import Placement, check_uncoupled
+from workbench.design.placement.limits import BOUNDED, Limits
+from workbench.design.placement.places import free_places, least_distances
+from workbench.design.placement.task import Placement, check_residual, check_uncoupled
+from workbench.design.spillover.performance import check_weight
 from workbench.design.spillover.spillover import settled_moments
 from workbench.rig.actuators import Actuator
 from workbench.structure.modes import Modes, modal_state_matrix
@@ -23,6 +26,7 @@ from workbench.structure.printed import counted
 from workbench.threads import one_blas_thread
 
 DRAWN, LOOKED_AT = 2_000, 300  # random placements, and how many of the best are tried as starts
+SCANNED = 2_000  # placements of a scan computed at once
 ON_THE_AXIS = 1e-7  # of the largest |pole|: a loop whose poles are nearer to the axis does not count as stable
 
 
@@ -50,12 +54,8 @@ def place_coupled(
     Raises:
         DesignError: fewer actuators than rigid modes controlled, or limits that no random placement meets.
     """
-    if not 1 <= n_controlled < modes.n_modes:
-        raise DesignError(
-            f"{n_controlled} of {modes.n_modes} modes controlled leave no residual mode, so there is no spillover"
-        )
-    if not weight > 0:
-        raise DesignError(f"the control weight R must be positive; got {weight:g}")
+    check_residual(modes, n_controlled)
+    check_weight(weight)
     rigid = int((modes.omega[:n_controlled] == 0).sum())
     if n_actuators < rigid:
         raise DesignError(
@@ -71,11 +71,7 @@ def place_coupled(
         if not allowed or (np.diff(at) < limits.spacing).any():
             return np.inf
         placement = coupled_costs(modes, n_controlled, at, impulse_at=impulse_at, weight=weight)
-        within = (
-            placement.effort <= limits.effort
-            and placement.peak_force <= limits.peak_force
-            and placement.condition <= limits.condition
-        )
+        within = all(getattr(placement, name) <= getattr(limits, name) for name in BOUNDED)
         return float(np.log(placement.residual_work)) if within and placement.residual_work > 0 else np.inf
 
     rng = np.random.default_rng(seed)
@@ -109,9 +105,6 @@ def coupled_costs(
         positions: (n_actuators,) m; any number.
         impulse_at: place of the impulse of 1 N s.
         weight: R of the actuator forces.
-
-    Raises:
-        DesignError: damping that couples the modes.
     """
     positions = np.sort(np.asarray(positions, float))
     n, m = n_controlled, positions.size
@@ -169,9 +162,6 @@ def coupled_batch(
     """W_R and effort (n_placements,) of coupled LQR at many placements (n_placements, n_actuators), m.
 
     Both are infinite where no regulator stabilises.
-
-    Raises:
-        DesignError: damping that couples the modes.
     """
     n, count = n_controlled, len(positions)
     shapes = modes.phi(positions.ravel()).reshape(*positions.shape, modes.n_modes)
@@ -197,3 +187,75 @@ def coupled_batch(
     decay = np.where(stabilised[:, None, None], -(poles.conj()[:, :, None] + poles[:, None, :]), 1.0)
     effort = np.einsum("pak,pkl,pal->p", amplitudes.conj(), 1.0 / decay, amplitudes, optimize=True).real
     return np.where(stabilised, work, np.inf), np.where(stabilised, effort, np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class CoupledScan:
+    """All placements on a grid.
+
+    Attributes:
+        best: of those that meet the limits.
+        tried: number of placements.
+        lower_bound: of W_R anywhere if √W_R and √effort change no faster between the grid's placements than from one
+            to the next; an estimate, not a proof.
+    """
+
+    best: Placement
+    tried: int
+    lower_bound: float
+
+
+@one_blas_thread
+def scan_coupled(
+    modes: Modes,
+    n_controlled: int,
+    n_actuators: int,
+    *,
+    impulse_at: float,
+    weight: float,
+    limits: Limits,
+    n_places: int = 60,
+) -> CoupledScan:
+    """The best of all placements on a uniform grid over the length for coupled LQR.
+
+    Args:
+        modes, n_controlled, n_actuators, impulse_at, weight, limits: as for `place_coupled`.
+        n_places: of the grid; the number of placements grows as n_places to the power n_actuators.
+
+    Raises:
+        DesignError: limits that no placement on the grid meets.
+    """
+    length, settings = modes.length, {"impulse_at": impulse_at, "weight": weight}
+    intervals = limits.intervals(n_actuators, length)
+    step = length / n_places
+    grid = step * (0.5 + np.arange(n_places))
+    index = np.array(list(combinations_with_replacement(range(n_places), n_actuators)))
+    parts = np.array_split(index, max(1, len(index) // SCANNED))
+    costs = [coupled_batch(modes, n_controlled, grid[part], **settings) for part in parts]
+    work, effort = (np.concatenate(each) for each in zip(*costs))
+    at = grid[index]
+    gaps = least_distances(at)
+    allowed = free_places(modes.domain, grid, intervals)[index].all(axis=1) & (gaps >= limits.spacing)
+    rated = np.where(allowed & (effort <= limits.effort), work, np.inf)
+    by_work = (i for i in np.argsort(rated) if np.isfinite(rated[i]))
+    placements = (coupled_costs(modes, n_controlled, at[i], **settings) for i in by_work)
+    best = next(filter(limits.satisfied_by, placements), None)
+    if best is None:
+        raise DesignError(f"none of {allowed.sum()} placements on the grid meets the limits; raise them")
+    widened = [(low - step / 2, high + step / 2) for low, high in intervals]
+    near = free_places(modes.domain, grid, widened)[index].all(axis=1)
+    near &= gaps + step >= limits.spacing
+    near &= _least(index, np.sqrt(effort), n_places) <= np.sqrt(limits.effort)
+    bound = np.maximum(_least(index, np.sqrt(work), n_places), 0.0)[near].min() ** 2
+    return CoupledScan(best, int(allowed.sum()), float(min(bound, best.residual_work)))
+
+
+def _least(index: Integers, values: Floats, n_places: int) -> Floats:
+    """Extrapolated lower bound of each value half-way to its neighbours, all actuators moved at once."""
+    field = np.full((n_places,) * index.shape[1], np.nan)
+    field[tuple(index.T)] = np.where(np.isfinite(values), values, np.nan)
+    fall = np.zeros(field.shape)
+    for axis in range(field.ndim):
+        change = np.nan_to_num(np.abs(np.diff(field, axis=axis, prepend=np.nan, append=np.nan)))
+        fall += 0.5 * np.maximum(np.delete(change, 0, axis), np.delete(change, -1, axis))
+    return np.asarray(values - fall[tuple(index.T)])

@@ -28,15 +28,16 @@ ROUND_OFF = 1e-8  # of g: a smaller residual g - c D⁻¹ cᵀ g is round-off, a
 # value, slope, curvature, most curvature and most rate, (n_nodes, n_modes)
 Tables = tuple[Floats, Floats, Floats, Floats, Floats]
 
+# Arguments of the compiled functions of cell bounds: node and h, (n,) the intervals of a cell and their half-widths;
+# tables of the shapes on all intervals; transforms, T (n_residual, n, n_columns); score, (n,) set to how much the width
+# of each interval weakens the bound.
+
 
 @njit(cache=True, nogil=True)
 def expanded(weights: Floats, node: int, h: float, tables: Tables) -> tuple[float, float, float]:
     """Value and slope of Σ_i w_i φ_i(x) at the centre of an interval, and its largest distance from the tangent there.
 
-    Args:
-        weights: (n_modes or fewer,) w, of the first modes.
-        node, h: the interval and its half-width.
-        tables: of the shapes on all intervals.
+    The weights w may be those of the first modes alone.
     """
     value, slope, curvature, most_curvature, most_rate = tables
     at, steep, curved, rate, most = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -69,11 +70,8 @@ def _largest_residual(node: Integers, h: Floats, tables: Tables, both: Floats, r
     """An upper bound of (Σ_j max_x ‖S^-½ (g(x) - Λᵀ b(x))‖²)^½ over the cell, where g(x) - Λᵀ b(x) = φ(x) `both`.
 
     Args:
-        node, h: (n,) intervals and their half-widths.
-        tables: of the shapes on all intervals.
         both: (n_modes, n) -Λ above the weights V_rᵀ T_rᵀ.
         root: (n, n) S^-½.
-        score: (n,) set to the increase by each interval's width.
     """
     n_modes, n = both.shape
     weighted = np.empty((n, n_modes))
@@ -113,12 +111,8 @@ def dual_bound(
     """Lower bound of √W_R in a cell under one limit; inf if no placement meets the limit, -inf if no bound is found.
 
     Args:
-        node, h: (n,) intervals and their half-widths.
-        tables: of the shapes on all intervals.
-        transforms: T (n_residual, n, n_columns).
         square, root, limit: S (n, n), S^-½ and L.
         singular: least pivot of D over its largest entry.
-        score: (n,) set to how much the width of each interval weakens the bound.
     """
     value, slope = tables[0], tables[1]
     n, n_modes = h.size, value.shape[1]

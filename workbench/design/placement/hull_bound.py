@@ -32,72 +32,47 @@ SINGULAR = 1e-9  # least pivot over the largest entry of B for reliable determin
 ROUND_OFF = 1e-6  # of ratios of such determinants
 LINE = 12  # steps of the line search
 
-
-class HullBound:
-    """A test that excludes cells (n_cells, n_actuators) of intervals without a placement better than wanted."""
-
-    def __init__(
-        self,
-        task: PlacementTask,
-        measures: tuple[Floats, Floats, Floats],
-        roots: Floats,
-        inverses: Floats,
-        limits: Floats,
-        condition: float,
-    ) -> None:
-        """Tabulate the shapes on the intervals.
-
-        Args:
-            task: of the placement.
-            measures: centre and half-width (n_intervals,), largest fourth derivative (n_intervals, n_modes).
-            roots, inverses, limits: S^½ and S^-½ (n_limits, n, n) and L (n_limits,), inf for that of the condition.
-            condition: limit of the condition of B.
-        """
-        n = task.n_controlled
-        centre, half, most_fourth = measures
-        angles = np.pi * np.array([7, 5, 3, 1]) / 8.0
-        values = np.array([task.shapes(centre + s * half) for s in np.cos(angles)])
-        a = [np.tensordot(np.cos(k * angles), values, 1) * (0.5 if k else 0.25) for k in range(4)]
-        remainder = most_fourth * (half[:, None] ** 4 / 192.0)
-        c = a[0] - a[2], a[1] - 3.0 * a[3], 2.0 * a[2], 4.0 * a[3]  # c_0 + c_1 s + c_2 s² + c_3 s³
-        inner, outer = (c[0] - c[2] / 3.0, c[1] / 3.0 - c[3]), (c[0] + c[2], c[1] + c[3])
-        points = np.stack([p + side * q for p, q in (outer, inner) for side in (-1.0, 1.0)], axis=1)
-        # of the columns of B on each interval: the least norm, and the remainder weighted by each S^-½
-        variation = np.abs(a[1]) + 2.0 * np.abs(a[2]) + np.abs(a[3]) + remainder
-        norms = np.linalg.norm(c[0][:, :n], axis=1) - np.linalg.norm(variation[:, :n], axis=1)
-        errors = remainder[:, :n] @ np.abs(inverses).transpose(0, 2, 1)
-        self._arguments = (
-            points,
-            remainder,
-            np.maximum(norms, 0.0) ** 2,
-            (errors**2).sum(axis=2),
-            np.array(task.roots, order="C"),
-            roots,
-            inverses,
-            limits,
-            float(condition),
-        )
-
-    def raise_to(self, wanted: float, cells: Integers, lower: Floats) -> None:
-        """Raise lower bounds (n_cells,) of √W_R to `wanted` where that is proven, in place."""
-        _raise_to(wanted, cells, *self._arguments, lower)
+HullTables = tuple[Floats, Floats, Floats, Floats, Floats, Floats, Floats, Floats, float]
 
 
-@njit(cache=True, nogil=True)
-def _raise_to(
-    wanted: float,
-    cells: Integers,
-    points: Floats,
-    remainder: Floats,
-    squared_norms: Floats,
-    squared_errors: Floats,
-    transforms: Floats,
+def hull_tables(
+    task: PlacementTask,
+    table: tuple[Floats, Floats, Floats],
     roots: Floats,
     inverses: Floats,
     limits: Floats,
     condition: float,
-    lower: Floats,
-) -> None:
+) -> HullTables:
+    """The tables of `raise_to`, from the shapes on the intervals.
+
+    Args:
+        task: of the placement.
+        table: centre and half-width (n_intervals,), largest fourth derivative (n_intervals, n_modes).
+        roots, inverses, limits: S^½ and S^-½ (n_limits, n, n) and L (n_limits,), inf for that of the condition.
+        condition: limit of the condition of B.
+    """
+    centre, half, most_fourth = table
+    n = task.n_controlled
+    angles = np.pi * np.array([7, 5, 3, 1]) / 8.0
+    values = np.array([task.shapes(centre + s * half) for s in np.cos(angles)])
+    a = [np.tensordot(np.cos(k * angles), values, 1) * (0.5 if k else 0.25) for k in range(4)]
+    remainder = most_fourth * (half[:, None] ** 4 / 192.0)
+    c = a[0] - a[2], a[1] - 3.0 * a[3], 2.0 * a[2], 4.0 * a[3]  # c_0 + c_1 s + c_2 s² + c_3 s³
+    inner, outer = (c[0] - c[2] / 3.0, c[1] / 3.0 - c[3]), (c[0] + c[2], c[1] + c[3])
+    points = np.stack([p + side * q for p, q in (outer, inner) for side in (-1.0, 1.0)], axis=1)
+    # of the columns of B on each interval: the least norm, and the remainder weighted by each S^-½
+    variation = np.abs(a[1]) + 2.0 * np.abs(a[2]) + np.abs(a[3]) + remainder
+    norms = np.linalg.norm(c[0][:, :n], axis=1) - np.linalg.norm(variation[:, :n], axis=1)
+    errors = remainder[:, :n] @ np.abs(inverses).transpose(0, 2, 1)
+    squared_norms, squared_errors = np.maximum(norms, 0.0) ** 2, (errors**2).sum(axis=2)
+    transforms = np.array(task.roots, order="C")
+    return points, remainder, squared_norms, squared_errors, transforms, roots, inverses, limits, float(condition)
+
+
+@njit(cache=True, nogil=True)
+def raise_to(wanted: float, cells: Integers, tables: HullTables, lower: Floats) -> None:
+    """Raise lower bounds (n_cells,) of √W_R of cells (n_cells, n_actuators) of intervals to `wanted` where proven."""
+    points, remainder, squared_norms, squared_errors, transforms, roots, inverses, limits, condition = tables
     n = cells.shape[1]
     for cell in range(len(cells)):
         node = cells[cell]
@@ -320,21 +295,15 @@ def is_excluded(
     """Whether no placement in the cell within the limit has a ‖Y‖ below `least`.
 
     Args:
-        node: (n,) intervals.
         points: (n_intervals, 4, n_modes) Bernstein points of the cubics.
         remainder: (n_intervals, n_modes) largest difference of the shapes from the cubics.
-        transforms: T (n_residual, n, n_columns).
         root, inverse_root, limit, eta: S^½ and S^-½ (n, n), L, and η < 1.
         least: y.
     """
     n_points, n_modes = points.shape[1:]
     n_residual, n, n_columns = transforms.shape
-    centre, choice, b, middle = (
-        np.empty((n, n_modes)),
-        np.empty((n, n_modes)),
-        np.empty((n, n_points, n)),
-        np.empty((n, 1, n)),
-    )
+    centre, choice = np.empty((n, n_modes)), np.empty((n, n_modes))
+    b, middle = np.empty((n, n_points, n)), np.empty((n, 1, n))
     largest = 0.0
     for j in range(n):
         own = points[node[j]]
@@ -352,12 +321,7 @@ def is_excluded(
     if not _evaluate(centre, transforms, root, 1.0, singular, inverse, y, f):
         return False
     chosen, w = np.zeros(n, np.int64), np.empty((n, n_points, n))
-    weights, constant, at_centre, multiplier = (
-        np.empty((n_residual, n)),
-        np.empty((n, n)),
-        np.empty(n),
-        np.empty((n, n)),
-    )
+    weights, constant, at_centre = np.empty((n_residual, n)), np.empty((n, n)), np.empty(n)
     _, sign = least_ratio(middle, middle, middle.shape[1], 1.0, -np.inf, singular, chosen)
     for _ in range(STEPS):
         size_y, size_f = np.sqrt(inner(y, y)), np.sqrt(inner(f, f))
@@ -384,9 +348,7 @@ def is_excluded(
         # first with the first half of the points alone, the ends of the intervals, which is cheap
         ratio, of_choice = least_ratio(b, w, n_points // 2, sign, -np.inf, singular, chosen)
         if ratio >= needed:
-            for i in range(n):
-                for c in range(n):
-                    multiplier[i, c] = 0.0
+            multiplier = np.zeros((n, n))
             for j in range(n):
                 for c in range(n):
                     at_centre[c] = constant[j, c]
@@ -403,9 +365,8 @@ def is_excluded(
         for j in range(n):
             for i in range(n_modes):
                 choice[j, i] = points[node[j], chosen[j], i]
-        if np.isinf(ratio) or not _evaluate(
-            choice, transforms, root, sign * of_choice, singular, ignored, new_y, new_f
-        ):
+        sign_there = sign * of_choice
+        if np.isinf(ratio) or not _evaluate(choice, transforms, root, sign_there, singular, ignored, new_y, new_f):
             return False
         t = _step(y, new_y, f, new_f, least, limit)
         for r in range(n_residual):

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial, wraps
+from functools import wraps
 from itertools import combinations
 from typing import Any, ParamSpec, TypeVar
 from warnings import warn
@@ -12,7 +12,7 @@ import numpy as np
 from workbench.design.laws.law import DesignError
 from workbench.design.placement.places import Box, coordinates, free_boxes, least_distances
 from workbench.design.placement.task import Placement, PlacementTask, batch_costs
-from workbench.renamed import Renamed, former_arguments
+from workbench.renamed import Renamed, former_fields
 from workbench.rig.actuators import command_unit
 from workbench.structure.domain import Interval, NamedPoints, Place, Rectangle, position, reach, same_place
 from workbench.structure.printed import Constructed, command_headings, in_unit
@@ -22,13 +22,14 @@ APART = 1e-6  # of the length: least distance of two actuators
 DRAWS = 20_000  # random placements, to find which limits conflict
 SAMPLES = 40  # places of these in every box
 
+BOUNDED = ("effort", "peak_force", "condition")
+
 Zone = tuple[Place, Place]
-
-
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
+@former_fields(margin="edge_distance")
 @dataclass(frozen=True, repr=False)
 class Limits(Constructed):
     """Constraints of a placement.
@@ -56,10 +57,9 @@ class Limits(Constructed):
     margin = Renamed("edge_distance")
 
     def __post_init__(self) -> None:
-        for name in ("effort", "peak_force", "condition"):
-            value = getattr(self, name)
-            if not value > 0:
-                raise DesignError(f"the limit of {name.replace('_', ' ')} must be positive; got {value:g}")
+        for name in BOUNDED:
+            if not getattr(self, name) > 0:
+                raise DesignError(f"the limit of {_words(name)} must be positive; got {getattr(self, name):g}")
         if not (0 <= self.spacing < np.inf and 0 <= self.edge_distance < np.inf):
             raise DesignError(
                 f"spacing and edge_distance must be 0 or more; got {self.spacing:g} and {self.edge_distance:g}"
@@ -76,7 +76,7 @@ class Limits(Constructed):
     @property
     def regular(self) -> bool:
         """Whether a limit excludes a singular B."""
-        return bool(np.isfinite([self.effort, self.peak_force, self.condition]).any())
+        return bool(np.isfinite([getattr(self, name) for name in BOUNDED]).any())
 
     def allowed(self, length: float, clear: float = 0.0) -> list[tuple[float, float]]:
         """Intervals where the middle of an actuator may stand, m.
@@ -84,20 +84,13 @@ class Limits(Constructed):
         Args:
             length: of the structure, m.
             clear: half the extent of an actuator, m.
-
-        Raises:
-            DesignError: no allowed interval, or a zone outside the structure.
         """
         zones = tuple((np.array([position(low)]), np.array([position(high)])) for low, high in self.forbidden)
         boxes = self._free(Interval(length), np.array([clear]), zones)
         return sorted((low.item(), high.item()) for low, high in boxes)
 
     def boxes(self, task: PlacementTask) -> list[Box]:
-        """Allowed boxes (low, high) of coordinates, m; none for named points.
-
-        Raises:
-            DesignError: no room for all actuators, or zones of another domain.
-        """
+        """Allowed boxes (low, high) of coordinates, m, checked to have room for actuators; none for named points."""
         domain = task.modes.domain
         if isinstance(domain, Interval):
             intervals = self.intervals(task.n_controlled, domain.length, task.reach[0])
@@ -126,11 +119,7 @@ class Limits(Constructed):
         return free_boxes(domain, np.maximum(self.edge_distance, half), widened)
 
     def intervals(self, n: int, length: float, clear: float = 0.0) -> list[tuple[float, float]]:
-        """The intervals of `allowed`, checked to have room for n actuators.
-
-        Raises:
-            DesignError: spacing and edge distance without room for n actuators.
-        """
+        """The intervals of `allowed`, checked to have room for n actuators."""
         margin = max(self.edge_distance, clear)
         needed = 2 * margin + (n - 1) * self.spacing
         if needed > length:
@@ -162,19 +151,14 @@ class Limits(Constructed):
         return self._exceeded(least_distances(at), costs)
 
     def _exceeded(self, gaps: Any, costs: Any) -> dict[str, Any]:
-        return {
-            "effort": _excess(costs.effort, self.effort),
-            "peak force": _excess(costs.peak_force, self.peak_force),
-            "condition": _excess(costs.condition, self.condition),
-            "spacing": (self.spacing - gaps) / self.spacing if self.spacing > 0 else np.zeros(np.shape(gaps)),
-        }
+        excess = {name: _excess(getattr(costs, name), getattr(self, name)) for name in BOUNDED}
+        shape = np.shape(gaps)
+        return excess | {"spacing": (self.spacing - gaps) / self.spacing if self.spacing > 0 else np.zeros(shape)}
 
     def satisfied_by(self, placement: Placement) -> bool:
         """Whether a placement at allowed places meets all limits, with its peak force in continuous time."""
         return all(excess <= TOLERANCE for excess in self._exceeded(placement.spacing, placement).values())
 
-
-Limits.__init__ = former_arguments(margin="edge_distance")(Limits.__init__)  # type: ignore[method-assign]
 
 FORMER = {"effort_limit": "effort", "peak_limit": "peak_force", "condition_limit": "condition"}
 FORMER |= {"margin": "edge_distance", **{name: name for name in ("spacing", "forbidden", "candidates")}}
@@ -217,32 +201,39 @@ def conflict(task: PlacementTask, limits: Limits, grid: np.ndarray | None = None
     costs = batch_costs(task, task.shapes(grid)[draws])
     violations = limits.violations(coordinates(domain, grid)[draws], costs)
     within = {name: excess <= TOLERANCE for name, excess in violations.items()}
-    measured = {"effort": costs.effort, "peak force": costs.peak_force, "condition": costs.condition}
-    given = {"effort": limits.effort, "peak force": limits.peak_force, "condition": limits.condition}
-    headings = (*command_headings(command_unit([task.actuator])), "")
-    worded = {name: partial(in_unit, heading=heading) for name, heading in zip(measured, headings, strict=True)}
+    headings = dict(zip(BOUNDED, (*command_headings(command_unit([task.actuator])), ""), strict=True))
+
+    def texts(name: str, kept: np.ndarray) -> tuple[str, str, str]:
+        """The name of a cost, its limit, and its least value among the placements kept."""
+        values = getattr(limits, name), getattr(costs, name)[kept].min()
+        limit, least = (in_unit(value, headings[name]) for value in values)
+        return _words(name), limit, least
+
     head = f"no placement of {n} actuators meets the limits"
     spaced, with_spacing, lower = within["spacing"], "", ""
     if limits.spacing > 0:
         with_spacing, lower = f" with a spacing of {limits.spacing:g} m", " or lower the spacing"
     if not spaced.any():
         return f"{head}: a spacing of {limits.spacing:g} m leaves no room; lower the spacing"
-    for name, values in measured.items():
+    for name in BOUNDED:
         if not (within[name] & spaced).any():
-            least = values[spaced].min()
+            words, limit, least = texts(name, spaced)
             return (
-                f"{head}: the limit of {name} is {worded[name](given[name])}{with_spacing}, and the least found was"
-                f" {worded[name](least)}: raise the limit of {name}{lower}"
+                f"{head}: the limit of {words} is {limit}{with_spacing}, and the least found was {least}: raise the"
+                f" limit of {words}{lower}"
             )
-    for one, other in combinations(measured, 2):
-        if not (within[one] & within[other] & spaced).any():
-            least = measured[other][within[one] & spaced].min()
+    for first, second in combinations(BOUNDED, 2):
+        if not (within[first] & within[second] & spaced).any():
+            (one, limit, _), (other, other_limit, least) = (texts(x, within[first] & spaced) for x in (first, second))
             return (
-                f"{head}: the limit of {one}, {worded[one](given[one])}, and the limit of {other},"
-                f" {worded[other](given[other])}, conflict; with the first the least {other} found was"
-                f" {worded[other](least)}: raise one of them"
+                f"{head}: the limit of {one}, {limit}, and the limit of {other}, {other_limit}, conflict; with the"
+                f" first the least {other} found was {least}: raise one of them"
             )
     return f"{head} together, though any two can be met; raise one of them"
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
 
 
 def _samples(low: np.ndarray, high: np.ndarray, per_side: int) -> np.ndarray:

@@ -132,16 +132,20 @@ def _guesses(
         excess = np.maximum(np.max(list(limits.violations(drawn, costs).values()), axis=0), 0.0)
         order = np.lexsort((costs.work, excess))
         return [_in_order(drawn[i]) for i in order[: starts + 2]]
-    length, (first, last) = domain.length, task.reach
-    margin = max(limits.edge_distance, first)
-    guesses = [first + (last - first) * (np.arange(n) + 1) / (n + 1)]
+    length, margin = domain.length, max(limits.edge_distance, task.reach[0])
+    guesses = [_evenly_spaced(task)]
     nodes = nodes_of_mode(task.modes, n)
     if nodes.size == n:
         guesses.append(np.sort(nodes))
-    guesses += [
-        np.sort(rng.uniform(margin + INSIDE * length, length - margin - INSIDE * length, n)) for _ in range(starts)
-    ]
+    first, last = margin + INSIDE * length, length - margin - INSIDE * length
+    guesses += [np.sort(rng.uniform(first, last, n)) for _ in range(starts)]
     return [guess[:, None] for guess in guesses]
+
+
+def _evenly_spaced(task: PlacementTask) -> np.ndarray:
+    """Places (n_actuators,) along an interval, m."""
+    (first, last), n = task.reach, task.n_controlled
+    return np.asarray(first + (last - first) * (np.arange(n) + 1) / (n + 1))
 
 
 def _solved(
@@ -174,16 +178,12 @@ def _next_homes(positions: np.ndarray, homes: Sequence[Box], boxes: Sequence[Box
     def room(at: np.ndarray, box: Box) -> float:
         return float(np.minimum(at - box[0], box[1] - at).min())
 
-    next_homes = []
+    edge, next_homes = ON_EDGE * size, []
     for at, home in zip(positions, homes, strict=True):
         widest = max(boxes, key=partial(room, at))
-        at_edge = room(at, home) < ON_EDGE * size
-        next_homes.append(widest if at_edge and room(at, widest) > ON_EDGE * size else home)
+        next_homes.append(widest if room(at, home) < edge < room(at, widest) else home)
     changed = any(one is not other for one, other in zip(next_homes, homes, strict=True))
     return next_homes if changed else None
-
-
-# --- CasADi
 
 
 def symbolic_work(task: PlacementTask) -> ca.Function:
@@ -298,9 +298,7 @@ def _typical_work(task: PlacementTask) -> float:
     """W_R that scales the objective: of evenly spaced places along an interval, or the median of random ones."""
     domain = task.modes.domain
     if isinstance(domain, Interval):
-        first, last = task.reach
-        n = task.n_controlled
-        places = (first + (last - first) * (np.arange(n) + 1) / (n + 1))[None]
+        places = _evenly_spaced(task)[None]
     else:
         low, high = reach(domain, task.actuator.at)  # type: ignore[arg-type]
         places = low + (high - low) * np.random.default_rng(0).random((101, task.n_controlled, 2))

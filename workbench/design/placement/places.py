@@ -12,11 +12,7 @@ Box = tuple[np.ndarray, np.ndarray]
 
 
 def as_places(domain: Domain, places: Any) -> np.ndarray:
-    """Places as an array: (...,) positions in m, (..., 2) pairs in m, or (...,) names.
-
-    Raises:
-        PlaceError: unknown names, or places that are not pairs.
-    """
+    """Places of a domain as an array: (...,) positions in m, (..., 2) pairs in m, or (...,) names."""
     if isinstance(domain, NamedPoints):
         names = np.atleast_1d(np.asarray(places, object))
         domain.locate(names.ravel())
@@ -58,9 +54,6 @@ def free_boxes(domain: Interval | Rectangle, margin: np.ndarray, zones: Sequence
         domain: an interval or a rectangle.
         margin: (n_coordinates,) from the ends, or from the edges along x and along y, m.
         zones: forbidden boxes, m.
-
-    Raises:
-        DesignError: no box.
     """
     slack = SLACK * domain.size
     free: list[Box] = [(margin, np.array(domain.length) - margin)]

@@ -58,11 +58,7 @@ def scan(task: PlacementTask, limits: Limits, *, n_places: int = 60) -> tuple[Pl
 
 
 def best_of_candidates(task: PlacementTask, limits: Limits) -> Placement:
-    """The best of all choices of candidate places; where there are too many, the best found by exchange.
-
-    Raises:
-        DesignError: limits that no choice meets; the message names the conflict.
-    """
+    """The best of all choices of candidate places; where there are too many, the best found by exchange."""
     grid = allowed_places(task, limits, 0)
     n = task.n_controlled
     if comb(len(grid), n) <= MOST_TRIED:
@@ -104,12 +100,7 @@ def _exchanged(
 
 
 def allowed_places(task: PlacementTask, limits: Limits, n_places: int) -> np.ndarray:
-    """The limits' candidate places, or a grid, without those in forbidden zones: (n_places,) or (n_places, 2).
-
-    Raises:
-        DesignError: fewer places than actuators.
-        PlaceError: a candidate that the structure does not have.
-    """
+    """The limits' candidate places, or a grid, without those in forbidden zones: (n_places,) or (n_places, 2)."""
     n, domain = task.n_controlled, task.modes.domain
     boxes = limits.boxes(task)
     if limits.candidates is not None:

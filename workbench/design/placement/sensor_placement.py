@@ -61,12 +61,8 @@ class SensorPlacement(Printed):
         line = f"{counted(len(self.positions), 'sensor')} placed: error of the filter {self.error:.3g}"
         line += f", of evenly spaced ones {self.evenly_spaced_error:.3g}"
         rows = [(str(i + 1), place_text(place)) for i, place in enumerate(self.places)]
-        return (
-            line,
-            ("sensor", "place"),
-            rows,
-            () if self.exhaustive else ("local optimum, the best of several starts",),
-        )
+        remarks = () if self.exhaustive else ("local optimum, the best of several starts",)
+        return line, ("sensor", "place"), rows, remarks
 
     @property
     def places(self) -> list[Place]:

@@ -50,12 +50,11 @@ class FeedbackTask:
 
     def __post_init__(self) -> None:
         freeze(self, "gain", "state")
-        if self.gain.ndim != 2 or self.gain.shape[0] != self.gain.shape[1]:
-            raise DesignError(f"the feedback gain must be square, one row per pair; got shape {self.gain.shape}")
-        if self.state.shape != (2 * self.modes.n_modes,):
-            raise DesignError(
-                f"the state has {2 * self.modes.n_modes} entries for {self.modes.n_modes} modes; got {self.state.shape}"
-            )
+        gain, state, n = self.gain.shape, self.state.shape, self.modes.n_modes
+        if len(gain) != 2 or gain[0] != gain[1]:
+            raise DesignError(f"the feedback gain must be square, one row per pair; got shape {gain}")
+        if state != (2 * n,):
+            raise DesignError(f"the state has {2 * n} entries for {n} modes; got {state}")
         if not (self.modes.omega > 0).all():
             raise DesignError("a rigid-body mode keeps its displacement under rate feedback; select the elastic modes")
         first, last = self.reach
@@ -127,12 +126,8 @@ class FeedbackPlacement(Printed):
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         line = f"{self.positions.size} collocated pair(s): E = {self.index:.6g}"
         rows = [(str(i + 1), f"{x:.5g}") for i, x in enumerate(self.positions)]
-        return (
-            line,
-            ("pair", "x [m]"),
-            rows,
-            (f"no placement is better by more than {self.gap:.2%} ({self.cells} cells)",),
-        )
+        remark = f"no placement is better by more than {self.gap:.2%} ({self.cells} cells)"
+        return line, ("pair", "x [m]"), rows, (remark,)
 
 
 def place_pairs(task: FeedbackTask, *, gap: float = 0.01, starts: int = 12, seed: int = 0) -> FeedbackPlacement:
@@ -154,14 +149,8 @@ def place_pairs(task: FeedbackTask, *, gap: float = 0.01, starts: int = 12, seed
     best, least = None, np.inf
     for _ in range(starts):
         start = first + np.sort(rng.uniform(0.0, free, n)) + task.spacing * np.arange(n)
-        result = minimize(
-            lambda x: float(task.index(x)),
-            start,
-            method="SLSQP",
-            bounds=[(first, last)] * n,
-            constraints=spaced,
-            options={"ftol": 1e-12},
-        )
+        settings = {"bounds": [(first, last)] * n, "constraints": spaced, "options": {"ftol": 1e-12}}
+        result = minimize(lambda x: float(task.index(x)), start, method="SLSQP", **settings)
         feasible = n == 1 or np.diff(result.x).min() >= task.spacing - TOLERANCE * task.modes.length
         if feasible and result.fun < least:
             best, least = result.x, float(result.fun)
@@ -185,15 +174,12 @@ def _proven(task: FeedbackTask, wanted: float) -> tuple[float, int, np.ndarray |
         feasible = (np.diff(cells, axis=1) + halves[:, 1:] + halves[:, :-1] >= task.spacing).all(axis=1)
         cells, halves = cells[feasible], halves[feasible]
         parts = max(1, len(cells) // BATCH)
-        bounds, indices, weights = [], [], []
+        bounds = []
         for centre, h in zip(np.array_split(cells, parts), np.array_split(halves, parts)):
             expansion = _Expansion(task, centre)
-            lower, weight = expansion.lower(h)
-            bounds.append(lower)
-            weights.append(weight)
-            indices.append(np.where(expansion.stable, expansion.index, np.inf))
+            bounds.append((*expansion.lower(h), np.where(expansion.stable, expansion.index, np.inf)))
         count += len(cells)
-        lower, index, weight = (np.concatenate(part) for part in (bounds, indices, weights))
+        lower, weight, index = (np.concatenate(part) for part in zip(*bounds))
         spaced = (np.diff(cells, axis=1) >= task.spacing).all(axis=1)
         below = np.flatnonzero(spaced & (index < wanted))
         if below.size:

@@ -15,6 +15,7 @@ the full loop it is exact. The pole does not move if either control spillover b_
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress, product
 
 import numpy as np
 from scipy.linalg import eig
@@ -24,7 +25,7 @@ from workbench.arrays import Complexes, Floats
 from workbench.design.estimation.controller import Controller, reading
 from workbench.design.laws.law import DesignError, linear
 from workbench.design.loop.closed_loop import ClosedLoop, close_with, rounding
-from workbench.renamed import Renamed, former_arguments
+from workbench.renamed import Renamed, former_fields
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.rig.statespace import input_matrix, lateness
@@ -95,6 +96,7 @@ class PoleShift:
         return sum(path.first_order for path in self.paths)
 
 
+@former_fields(reduced_margin="reduced_decay_rate")
 @dataclass(frozen=True, eq=False, repr=False)
 class Explanation(Printed):
     """The closed loop of a controller on the full plant, with the pole shift of each residual mode.
@@ -122,28 +124,16 @@ class Explanation(Printed):
         return first if first and first.closed_pole.real == self.poles.real.max() else None
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        hz = self.loop.modes.frequencies_hz
         rows = [
-            (
-                str(each.mode + 1),
-                f"{self.loop.modes.frequencies_hz[each.mode]:.4g}",
-                f"{each.pole.real:.4g}",
-                f"{each.closed_pole.real:.4g}",
-                each.dominant.text,
-            )
-            for each in self.shifts
+            (str(s.mode + 1), *(f"{x:.4g}" for x in (hz[s.mode], s.pole.real, s.closed_pole.real)), s.dominant.text)
+            for s in self.shifts
         ]
         cause = self.destabilising
-        remarks = (
-            f"controlled modes alone: decay rate {self.reduced_decay_rate:.3g} 1/s",
-            *((f"mode {cause.mode + 1} makes the loop unstable",) if cause else ()),
-        )
-        headings = (
-            "residual mode",
-            "frequency [Hz]",
-            "Re λ, open loop [1/s]",
-            "Re λ, closed loop [1/s]",
-            "dominant path",
-        )
+        remarks = [f"controlled modes alone: decay rate {self.reduced_decay_rate:.3g} 1/s"]
+        remarks += [f"mode {cause.mode + 1} makes the loop unstable"] if cause else []
+        of_pole = "Re λ, open loop [1/s]", "Re λ, closed loop [1/s]"
+        headings = ("residual mode", "frequency [Hz]", *of_pole, "dominant path")
         line = f"closed loop of {counted(self.loop.modes.n_modes, 'mode')}: {self.loop.stability_text}"
         return line, headings, rows, remarks
 
@@ -158,11 +148,6 @@ class Explanation(Printed):
         return self.loop.decay_rate
 
     margin = Renamed("decay_rate")
-
-
-Explanation.__init__ = former_arguments(  # type: ignore[method-assign]
-    reduced_margin="reduced_decay_rate"
-)(Explanation.__init__)
 
 
 def explain_spillover(modes: Modes, controller: Controller) -> Explanation:
@@ -244,14 +229,11 @@ def _destabilising(
 
 
 class _ResidualMode:
-    """Residual mode r, of open-loop pole λ, in the loop of all the others: T = (I - C G)⁻¹ C, C the controller.
+    """Residual mode r (zero-based), of open-loop pole λ, in the loop of the others, T = (I - C G)⁻¹ C of controller C.
 
     Args:
-        modes, controller: of the loop.
         inputs: (n_modes, n_actuators) modal forces per command.
         outputs: (n_channels, 2 n_modes) from the state to the readings.
-        r: zero-based.
-        pole: λ.
     """
 
     def __init__(
@@ -268,13 +250,11 @@ class _ResidualMode:
         exact = self._terms(closed)
         double = abs(self._slope(self._pole)) <= DOUBLE * abs(self._pole)
         first = np.full_like(exact, complex(np.nan, np.nan)) if double else self._terms(self._pole)
-        paths = []
-        for j, actuator in enumerate(self._controller.law.actuators):
-            for place in self._controller.places:
-                here = [sensor.at == place for sensor in self._controller.sensors]
-                names = tuple(sensor.name for sensor in self._controller.sensors if sensor.at == place)
-                shift, first_order = complex(exact[j, here].sum()), complex(first[j, here].sum())
-                paths.append(Path(actuator.name, place, shift, first_order, names))
+        paths, sensors = [], self._controller.sensors
+        for (j, actuator), place in product(enumerate(self._controller.law.actuators), self._controller.places):
+            here = [sensor.at == place for sensor in sensors]
+            shift, first_order = complex(exact[j, here].sum()), complex(first[j, here].sum())
+            paths.append(Path(actuator.name, place, shift, first_order, tuple(s.name for s in compress(sensors, here))))
         return PoleShift(self._r, self._pole, closed, tuple(sorted(paths, key=lambda path: -path.shift.real)))
 
     def _terms(self, s: complex) -> Complexes:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from workbench.design.spillover.spillover import (
     second_moments,
     work_by_mode,
 )
-from workbench.renamed import Renamed, former_arguments
+from workbench.renamed import Renamed, former_fields
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.rig.statespace import input_matrix
@@ -35,6 +36,7 @@ from workbench.structure.plate import Membrane, Plate
 from workbench.threads import one_blas_thread
 
 
+@former_fields(margin="decay_rate")
 @dataclass(frozen=True)
 class Performance:
     """Performance of a design up to the final time; cost, effort and W_R are infinite where a pole is unstable.
@@ -54,9 +56,6 @@ class Performance:
     spilled, margin = Renamed("spillover"), Renamed("decay_rate")
 
 
-Performance.__init__ = former_arguments(margin="decay_rate")(Performance.__init__)  # type: ignore[method-assign]
-
-
 def performance(loop: ClosedLoop, state: np.ndarray, *, weight: float, final_time: float) -> Performance:
     """The performance of a linear loop, exact: integrals of quadratic forms of the state by one matrix exponential.
 
@@ -66,15 +65,15 @@ def performance(loop: ClosedLoop, state: np.ndarray, *, weight: float, final_tim
         weight: R of the actuator forces.
         final_time: s.
     """
-    _check_weight(weight)
+    check_weight(weight)
     check_final_time(final_time)
     modes, n = loop.modes, loop.modes.n_modes
     rate = loop.decay_rate
     if loop.unstable_poles.size:
         return Performance(np.inf, np.inf, np.inf, rate)
     moments = second_moments(loop.matrix, loop.start(state), final_time)
-    own = list(loop.law.controlled)
-    energy = modes.omega[own] ** 2 @ np.diag(moments)[own] + np.diag(moments)[[n + r for r in own]].sum()
+    own, squares = list(loop.law.controlled), np.diag(moments)
+    energy = modes.omega[own] ** 2 @ squares[own] + squares[[n + r for r in own]].sum()
     used = float(np.trace(loop.feedback @ moments @ loop.feedback.T))
     spillover = float(np.delete(work_by_mode(loop, moments), own).sum())
     return Performance(float(energy) + weight * used, used, spillover, rate)
@@ -88,17 +87,18 @@ def on_off_performance(
     Raises:
         DesignError: an actuator that `respond_on_off` refuses.
     """
-    _check_weight(weight)
+    check_weight(weight)
     check_final_time(final_time)
-    response, instants = on_off_motion(modes, law, state, final_time)
-    used = float((response.forces**2).sum(axis=0) @ instants)
-    energy = float(2.0 * response.energy[list(law.controlled)].sum(axis=0) @ instants)
+    response, weights = on_off_motion(modes, law, state, final_time)
+    used = float((response.forces**2).sum(axis=0) @ weights)
+    energy = float(2.0 * response.energy[list(law.controlled)].sum(axis=0) @ weights)
     rest = [r for r in range(modes.n_modes) if r not in law.controlled]
     power = (input_matrix(modes, law.actuators)[rest] @ response.forces) * response.modal[modes.n_modes :][rest]
-    return Performance(energy + weight * used, used, float((power @ instants).sum()), np.nan)
+    return Performance(energy + weight * used, used, float((power @ weights).sum()), np.nan)
 
 
-def _check_weight(weight: float) -> None:
+def check_weight(weight: float) -> None:
+    """Refuse a control weight R that is not positive."""
     if not weight > 0:
         raise DesignError(f"the control weight R must be positive; got {weight:g}")
 
@@ -141,9 +141,6 @@ def laws_of(
     """The laws that can be designed, IMSC and coupled LQR, and why others cannot.
 
     With a damping ratio, the same two by pole assignment too.
-
-    Raises:
-        DesignError: no law can be designed.
     """
     if damping is not None and not 0 < damping < 1:
         raise DesignError(f"the damping ratio wanted must lie between 0 and 1; got {damping:g}")
@@ -163,13 +160,10 @@ def laws_of(
         else:
             poles = omega * (-damping + 1j * np.sqrt(1 - damping**2))
     laws = []
-    if independent:
-        laws.append(imsc(modes, controlled, actuators, weight=weight))
+    for by_weight, by_poles in [(imsc, imsc_poles)] * independent + [(coupled_lqr, coupled_poles)]:
+        laws.append(by_weight(modes, controlled, actuators, weight=weight))
         if poles is not None:
-            laws.append(imsc_poles(modes, controlled, actuators, poles=poles))
-    laws.append(coupled_lqr(modes, controlled, actuators, weight=weight))
-    if poles is not None:
-        laws.append(coupled_poles(modes, controlled, actuators, poles=poles))
+            laws.append(by_poles(modes, controlled, actuators, poles=poles))
     return laws, refused
 
 
@@ -187,21 +181,19 @@ def compare(
         final_time: s, of work and peak force.
     """
     check_final_time(final_time)
-    rows = []
-    for law in laws:
-        loop = close_loop(modes, law)
-        rows.append(
-            LawPerformance(
-                law=law,
-                cost=quadratic_cost(modes, law, state, weight),
-                effort=effort(modes, law, state),
-                peak_force=peak_force(loop, state, final_time),
-                work=finite_spillover(loop, state, final_time),
-                poles=loop.poles,
-                stability=loop.stability,
-            )
+    loops = [close_loop(modes, law) for law in laws]
+    return tuple(
+        LawPerformance(
+            law=law,
+            cost=quadratic_cost(modes, law, state, weight),
+            effort=effort(modes, law, state),
+            peak_force=peak_force(loop, state, final_time),
+            work=finite_spillover(loop, state, final_time),
+            poles=loop.poles,
+            stability=loop.stability,
         )
-    return tuple(rows)
+        for law, loop in zip(laws, loops, strict=True)
+    )
 
 
 def through_sensors(
@@ -209,27 +201,25 @@ def through_sensors(
 ) -> tuple[tuple[Controller | None, Explanation | None, str], ...]:
     """Each law with each estimator that sensors at the places allow: a modal filter and a Luenberger observer.
 
+    Each is (controller, explanation on the full plant, ""), or (None, None, reason) where the design fails.
+
     Args:
         modes: controlled and residual.
         laws: to try.
         places: of the sensors: displacement for an observer, displacement and velocity for a filter.
         structure: gives the mass for the filters; without it filters are tried at named points alone.
-
-    Returns:
-        (controller, explanation on the full plant, "") each, or (None, None, reason) where the design fails.
     """
     sensor_places = sorted(set(places))
     sensors = [Sensor(f"y{i + 1}", x) for i, x in enumerate(sensor_places)]
     tried: list[tuple[Controller | None, Explanation | None, str]] = []
     estimators = (True, False) if structure is not None or isinstance(modes.domain, NamedPoints) else (False,)
-    for law in laws:
-        for by_filter in estimators:
-            try:
-                if by_filter:
-                    controller = filtered(law, filter_on(structure, modes, law.controlled, sensor_places))
-                else:
-                    controller = luenberger_controller(modes, law, sensors, poles=usual_poles(modes, law.controlled))
-                tried.append((controller, explain_spillover(modes, controller), ""))
-            except ValueError as error:
-                tried.append((None, None, f"{law.name}: {error}"))
+    for law, by_filter in product(laws, estimators):
+        try:
+            if by_filter:
+                controller = filtered(law, filter_on(structure, modes, law.controlled, sensor_places))
+            else:
+                controller = luenberger_controller(modes, law, sensors, poles=usual_poles(modes, law.controlled))
+            tried.append((controller, explain_spillover(modes, controller), ""))
+        except ValueError as error:
+            tried.append((None, None, f"{law.name}: {error}"))
     return tuple(tried)

@@ -12,7 +12,7 @@ import numpy as np
 
 from workbench.design.estimation.controller import Controller
 from workbench.design.loop.closed_loop import close_with, rounding
-from workbench.renamed import Renamed, former_arguments
+from workbench.renamed import Renamed, former_arguments, former_fields
 from workbench.rig.actuators import Actuator
 from workbench.structure.domain import (
     Between,
@@ -40,6 +40,7 @@ PER_SIDE = 12  # places along the longer side of a plate where a sensor may be a
 APART = 1e-3  # of the size of the structure: least distance of an added sensor from others
 
 
+@former_fields(margin="decay_rate")
 @dataclass(frozen=True, eq=False)
 class Remedy:
     """The smallest change of one kind that stabilises the loop.
@@ -59,9 +60,6 @@ class Remedy:
     controller: Controller
 
     margin = Renamed("decay_rate")
-
-
-Remedy.__init__ = former_arguments(margin="decay_rate")(Remedy.__init__)  # type: ignore[method-assign]
 
 
 @dataclass(frozen=True)
@@ -119,21 +117,18 @@ def spillover_remedies(
     remedies = []
     reduction = _smallest(lambda size: excess(replace(start, share=1.0 - size)), 1.0)
     if reduction is not None:
-        setting = replace(start, share=1.0 - reduction)
-        remedies.append(remedy("gain", f"gain scaled by {setting.share:.3f}", reduction, setting))
+        share = 1.0 - reduction
+        remedies.append(remedy("gain", f"gain scaled by {share:.3f}", reduction, replace(start, share=share)))
     for kind, movable in (("actuator", _actuators(start)), ("sensor", _sensors(start, domain))):
-        best: tuple[float, str, _Setting] | None = None
+        best: tuple[str, float, _Setting] | None = None
         for name, where, put in movable:
-
-            def excess_at(at: Location, put: Callable[[Any], _Setting] = put) -> float:
-                return excess(put(at))
-
-            moved = _smallest_move(domain, where, excess_at, best[0] if best else np.inf)
+            least = best[1] if best else np.inf
+            moved = _smallest_move(domain, where, lambda at, put=put: excess(put(at)), least)  # type: ignore[misc]
             if moved is not None:
-                text = domain.text(middle(moved[1]), digits=4)
-                best = moved[0], f"{name} moved to {text}", put(moved[1])
+                distance, end = moved
+                best = f"{name} moved to {domain.text(middle(end), digits=4)}", distance, put(end)
         if best is not None:
-            remedies.append(remedy(kind, best[1], best[0], best[2]))
+            remedies.append(remedy(kind, *best))
     added = _added(start, excess, domain, max_added)
     if added is not None:
         new = [at for at in added.sensors if at not in start.sensors]
@@ -144,11 +139,7 @@ def spillover_remedies(
 
 @former_arguments(most="max_sensors")
 def sufficient_sensors(
-    modes: Modes,
-    redesign: Redesign,
-    actuators: Sequence[Actuator],
-    *,
-    max_sensors: int = 60,
+    modes: Modes, redesign: Redesign, actuators: Sequence[Actuator], *, max_sensors: int = 60
 ) -> tuple[int | None, np.ndarray]:
     """The least number of evenly spaced sensors that stabilises the loop, and the decay rates of 1, 2, … sensors, 1/s.
 

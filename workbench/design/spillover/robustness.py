@@ -15,13 +15,14 @@ from workbench.design.estimation.controller import Controller
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.loop.closed_loop import close_with
 from workbench.design.spillover.spillover import finite_spillover
-from workbench.renamed import Renamed, former_arguments
+from workbench.renamed import Renamed, former_fields
 from workbench.structure.modes import Modes, freeze
 from workbench.threads import one_blas_thread
 
 LEAST_OMEGA = 1e-3  # of the frequency: lower bound of a drawn one
 
 
+@former_fields(margins="decay_rates")
 @dataclass(frozen=True, eq=False)
 class Robustness:
     """Decay rates and spillover of a design on many perturbed models.
@@ -57,9 +58,6 @@ class Robustness:
             return np.nan, np.nan, np.nan
         low, median, high = np.quantile(stable, (0.5 - 0.5 * level, 0.5, 0.5 + 0.5 * level))
         return float(low), float(median), float(high)
-
-
-Robustness.__init__ = former_arguments(margins="decay_rates")(Robustness.__init__)  # type: ignore[method-assign]
 
 
 def draw_modes(

@@ -22,7 +22,7 @@ from workbench.design.laws.law import DesignError, Law, controlled_indices
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.closed_loop import ClosedLoop, Response, close_loop
 from workbench.design.loop.on_off_response import motion, switchings
-from workbench.renamed import Renamed, former_arguments
+from workbench.renamed import Renamed, former_fields
 from workbench.rig.linear import integrated
 from workbench.rig.statespace import input_matrix
 from workbench.structure.domain import gauss_between
@@ -32,6 +32,7 @@ from workbench.structure.printed import Printed
 GAUSS_POINTS = 12  # per radian of the fastest mode between switchings
 
 
+@former_fields(by_mode="work_by_mode")
 @dataclass(frozen=True, eq=False, repr=False)
 class Spillover(Printed):
     """Work of the actuators by mode, J (or the consistent unit).
@@ -87,9 +88,6 @@ class Spillover(Printed):
         return line, ("mode", "", "W_r [J]"), rows, ()
 
 
-Spillover.__init__ = former_arguments(by_mode="work_by_mode")(Spillover.__init__)  # type: ignore[method-assign]
-
-
 def spillover(modes: Modes, law: Law, state: np.ndarray) -> Spillover:
     """Work in every mode for t_f to infinity, in closed form, of a law on exact modal coordinates.
 
@@ -114,10 +112,10 @@ def spillover(modes: Modes, law: Law, state: np.ndarray) -> Spillover:
     if residual:
         omega = modes.omega[residual]
         force = input_matrix(modes, law.actuators)[residual]
-        push = np.einsum("rj,jr->r", force, _force_transform(loop, start, feedback, 1j * omega))
+        drive = np.einsum("rj,jr->r", force, _force_transform(loop, start, feedback, 1j * omega))
         moving = state[[n + r for r in residual]] + 1j * omega * state[residual]
         # z = q' + iω q leaves z(∞) e^{-iωt} = z0 + F(iω)
-        work[residual] = 0.5 * np.abs(push) ** 2 + (np.conj(moving) * push).real
+        work[residual] = 0.5 * np.abs(drive) ** 2 + (np.conj(moving) * drive).real
     return Spillover(work, law.controlled, np.inf)
 
 
@@ -132,13 +130,10 @@ def _force_transform(loop: Floats, start: Floats, feedback: Floats, s: Complexes
 
 
 def _controlled_loop(modes: Modes, law: Law, state: Floats) -> tuple[Floats, Floats, Floats, Flags]:
-    """The closed loop of the states that the actuator forces depend on.
+    """The closed loop of the states that the actuator forces depend on: A, start, feedback, and their mask (n_states,).
 
-    These are the controlled modes, and others where damping couples them. The displacement of a rigid mode without a
-    gain is not among them.
-
-    Returns:
-        A of these states, their initial values, the matrix from them to the forces, and the mask (n_states,) of them.
+    These are the controlled modes, and others where damping couples them, without the displacement of a rigid mode
+    that has no gain.
     """
     loop, index = close_loop(modes, law), np.array(law.controlled)
     own = np.asarray(loop.feedback.any(axis=0))
@@ -148,11 +143,7 @@ def _controlled_loop(modes: Modes, law: Law, state: Floats) -> tuple[Floats, Flo
 
 
 def check_final_time(final_time: float) -> None:
-    """Refuse a final time that is not positive and finite.
-
-    Raises:
-        DesignError: a time that is not positive and finite.
-    """
+    """Refuse a final time that is not positive and finite."""
     if not (np.isfinite(final_time) and final_time > 0):
         raise DesignError(f"the final time must be positive and finite; got {final_time:g}")
 
@@ -211,11 +202,10 @@ def _integral(modes: Modes, law: Law, state: Floats, energies: float, weight: fl
     poles = np.linalg.eigvals(loop)
     if poles.real.max() >= -ON_AXIS * np.abs(poles).max():
         return np.inf
-    gramian = settled_moments(loop, start)
     index, weighed = np.array(law.controlled), np.zeros(kept.size)
     weighed[index], weighed[modes.n_modes + index] = energies * modes.omega[index] ** 2, energies
     r = feedback.T @ weight @ feedback if np.ndim(weight) else weight * feedback.T @ feedback
-    return float(np.trace((np.diag(weighed[kept]) + r) @ gramian))
+    return float(np.trace((np.diag(weighed[kept]) + r) @ settled_moments(loop, start)))
 
 
 def quadratic_cost(modes: Modes, law: Law, state: np.ndarray, weight: float | np.ndarray) -> float:
