@@ -217,6 +217,9 @@ class Reconstruction(Protocol):
     def places_to_try(self) -> Sequence[Any]: ...
 
 
+Starts = Callable[[Reconstruction, Any], Iterable[dict[str, Any]]]
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Kind:
     """A kind of effect in the catalogue: all that a diagnosis knows of it, from start values to drawings.
@@ -260,7 +263,7 @@ class Kind:
     path: str
     parameters: Callable[[Rig, Any], tuple[Parameter, ...]]
     apply: Callable[[Rig, Any, dict[str, Any]], Rig]
-    starts: Callable[[Reconstruction, Any], Iterable[dict[str, Any]]]
+    starts: Starts
     targets: Callable[[Rig], tuple[Any, ...]] = lambda rig: (None,)
     nonlinear: bool = False
     phrase: str = ""

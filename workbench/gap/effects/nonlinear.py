@@ -9,10 +9,12 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.gap.effects.effect import (
     Effect,
+    ForceAndMotion,
     Kind,
     Parameter,
     Reconstruction,
     Scales,
+    Starts,
     place_of,
     place_parameters,
     place_values,
@@ -47,14 +49,23 @@ def with_element(rig: Rig, element: Element) -> Rig:
     return replace(rig, elements=(*rig.elements, element))
 
 
+def _at_peaks(start: Callable[[ForceAndMotion], Iterable[dict[str, float]]]) -> Starts:
+    """Start values at each of the likeliest places, from the unmodelled force and the motion there."""
+    return lambda reconstruction, _: (
+        {**place_values(place.at), **values} for place in reconstruction.at_peaks for values in start(place)
+    )
+
+
+def _rms(motion: Floats) -> float:
+    return float(np.sqrt(np.mean(motion**2)))
+
+
 # --- cubic_spring
 
 
-def _cubic_starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
-    for place in reconstruction.at_peaks:
-        k = place.strength_along(place.displacement**3)
-        for share in (0.3, 1.0, -1.0, 3.0):
-            yield {**place_values(place.at), "stiffness": share * k}
+def _cubic_starts(place: ForceAndMotion) -> list[dict[str, float]]:
+    k = place.strength_along(place.displacement**3)
+    return [{"stiffness": share * k} for share in (0.3, 1.0, -1.0, 3.0)]
 
 
 def _cubic_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
@@ -67,7 +78,7 @@ CUBIC_SPRING = Kind(
     path="structure",
     parameters=_cubic_parameters,
     apply=lambda rig, _, v: with_element(rig, CubicSpring(place_of(v), v["stiffness"])),
-    starts=_cubic_starts,
+    starts=_at_peaks(_cubic_starts),
     nonlinear=True,
     force_laws={"displacement": lambda v, w: -v["stiffness"] * w**3},
     phrase="a cubic spring",
@@ -97,7 +108,7 @@ MIDPLANE_STRETCHING = Kind(
     starts=_stretching_starts,
     targets=lambda rig: (None,) if isinstance(rig.structure, Structure) else (),
     nonlinear=True,
-    phrase="stretching of the midplane",
+    phrase="midplane stretching",
 )
 
 
@@ -141,20 +152,13 @@ def _contact_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
     return (*place_parameters(rig), stiffness, positive("gap", "m", scales.length))
 
 
-def _contact_starts(two_sided: bool) -> Callable[[Reconstruction, object], Iterator[dict[str, Any]]]:
-    def starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
-        for place in reconstruction.at_peaks:
-            reach = np.abs(place.displacement) if two_sided else place.displacement
-            if not (reach > 0).any():  # the motion stays on the other side, as under a constant force
-                continue
-            levels = np.quantile(reach[reach > 0], (0.3, 0.5, 0.65, 0.8, 0.9, 0.96, 0.99))
-            for gap in levels:
-                over = np.maximum(reach - gap, 0.0) * np.sign(place.displacement)
-                k = place.strength_along(over)
-                for share in (1.0, 4.0) if k > 0 else ():
-                    yield {**place_values(place.at), "stiffness": share * k, "gap": float(gap)}
-
-    return starts
+def _contact_starts(place: ForceAndMotion, reach: Floats) -> Iterator[dict[str, float]]:
+    """Start values of a contact that closes at quantiles of the displacement towards it, `reach` (n_total,)."""
+    if not (reach > 0).any():  # the motion stays on the other side, as under a constant force
+        return
+    for gap in np.quantile(reach[reach > 0], (0.3, 0.5, 0.65, 0.8, 0.9, 0.96, 0.99)):
+        k = place.strength_along(np.maximum(reach - gap, 0.0) * np.sign(place.displacement))
+        yield from ({"stiffness": share * k, "gap": float(gap)} for share in (1.0, 4.0) if k > 0)
 
 
 def _without_gap(effect: Effect, _: Rig) -> tuple[Effect, ...]:
@@ -166,11 +170,11 @@ CLEARANCE = Kind(
     path="structure",
     parameters=_contact_parameters,
     apply=lambda rig, _, v: with_element(rig, Clearance(place_of(v), v["stiffness"], v["gap"])),
-    starts=_contact_starts(True),
+    starts=_at_peaks(lambda place: _contact_starts(place, np.abs(place.displacement))),
     nonlinear=True,
     simpler=_without_gap,
     force_laws={"displacement": lambda v, w: -v["stiffness"] * np.sign(w) * np.maximum(np.abs(w) - v["gap"], 0.0)},
-    phrase="a clearance closed on both sides by springs",
+    phrase="a two-sided clearance",
 )
 
 ONE_SIDED_STOP = Kind(
@@ -178,7 +182,7 @@ ONE_SIDED_STOP = Kind(
     path="structure",
     parameters=_contact_parameters,
     apply=lambda rig, _, v: with_element(rig, OneSidedStop(place_of(v), v["stiffness"], v["gap"])),
-    starts=_contact_starts(False),
+    starts=_at_peaks(lambda place: _contact_starts(place, place.displacement)),
     nonlinear=True,
     force_laws={"displacement": lambda v, w: -v["stiffness"] * np.maximum(w - v["gap"], 0.0)},
     phrase="a one-sided stop",
@@ -188,13 +192,10 @@ ONE_SIDED_STOP = Kind(
 # --- coulomb_friction
 
 
-def _friction_starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
-    for place in reconstruction.at_peaks:
-        speed = float(np.sqrt(np.mean(place.velocity**2)))
-        for share in (0.02, 0.1, 0.3):
-            force = place.strength_along(np.tanh(place.velocity / (share * speed)))
-            for part in (1.0, 2.0) if force > 0 else ():
-                yield {**place_values(place.at), "force": part * force, "smoothing_speed": share * speed}
+def _friction_starts(place: ForceAndMotion) -> Iterator[dict[str, float]]:
+    for speed in np.array([0.02, 0.1, 0.3]) * _rms(place.velocity):
+        force = place.strength_along(np.tanh(place.velocity / speed))
+        yield from ({"force": part * force, "smoothing_speed": float(speed)} for part in (1.0, 2.0) if force > 0)
 
 
 def _as_damper(friction: Effect, _: Rig) -> tuple[Effect, ...]:
@@ -214,8 +215,8 @@ def _has_negligible_speed(friction: Effect) -> bool:
 
 def _stated_numbers(friction: Effect, _: Rig) -> dict[str, float]:
     """The parameters of friction, without a smoothing speed that cannot be distinguished from zero."""
-    numbers = friction.numbers
-    return {name: v for name, v in numbers.items() if name != "smoothing_speed" or not _has_negligible_speed(friction)}
+    left_out = ("smoothing_speed",) if _has_negligible_speed(friction) else ()
+    return {name: value for name, value in friction.numbers.items() if name not in left_out}
 
 
 def _with_negligible_speed(friction: Effect) -> Effect:
@@ -229,20 +230,16 @@ def _with_negligible_speed(friction: Effect) -> Effect:
     )
 
 
-def _direction_dependent(friction: Effect) -> tuple[Effect, ...]:
-    force = friction.values["force"]
-    numbers = {**friction.values, "force_forward": force, "force_backward": force}
-    return (Effect(TWO_WAY_FRICTION, None, {n: v for n, v in numbers.items() if n != "force"}),)
+def _direction_dependent(friction: Effect, offset: float = 0.0) -> Effect:
+    numbers = _two_way_values(friction.values["force"], offset, friction.values["smoothing_speed"])
+    return Effect(TWO_WAY_FRICTION, None, {**place_values(friction.at), **numbers})
 
 
 def _merged_with_bias(friction: Effect, other: Effect) -> Effect | None:
     """Friction and a constant force as direction-dependent friction, which an offset of a drive looks like."""
-    if other.kind is not ACTUATOR_BIAS:
+    if other.kind is not ACTUATOR_BIAS or abs(other.values["force"]) >= friction.values["force"]:
         return None
-    (both,), force, offset = _direction_dependent(friction), friction.values["force"], other.values["force"]
-    if abs(offset) >= force:
-        return None
-    return replace(both, values={**both.values, "force_forward": force - offset, "force_backward": force + offset})
+    return _direction_dependent(friction, -other.values["force"])
 
 
 COULOMB_FRICTION = Kind(
@@ -254,9 +251,9 @@ COULOMB_FRICTION = Kind(
         positive("smoothing_speed", "m/s", Scales.of(rig).speed),
     ),
     apply=lambda rig, _, v: with_element(rig, CoulombFriction(place_of(v), v["force"], v["smoothing_speed"])),
-    starts=_friction_starts,
+    starts=_at_peaks(_friction_starts),
     nonlinear=True,
-    more_general=_direction_dependent,
+    more_general=lambda friction: (_direction_dependent(friction),),
     merged=_merged_with_bias,
     simpler=_as_damper,
     force_laws={"velocity": lambda v, u: -v["force"] * np.tanh(u / v["smoothing_speed"])},
@@ -273,7 +270,7 @@ def _bouc_wen_starts(reconstruction: Reconstruction, _: object) -> Iterator[dict
     # with named points, the likeliest places need not be close to the right one, which may come third
     most = None if isinstance(reconstruction.rig.modes.domain, NamedPoints) else 2
     for place in reconstruction.at_peaks[:most]:
-        size = float(np.sqrt(np.mean(place.displacement**2)))
+        size = _rms(place.displacement)
         for share in (0.03, 0.1, 0.3, 1.0, 3.0):
             k = place.strength_along(hysteresis(place.displacement, share * size))
             for part in (1.0, 2.0) if k > 0 else ():
@@ -306,13 +303,11 @@ BOUC_WEN = Kind(
 # --- joint_slip
 
 
-def _slip_starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
-    for place in reconstruction.at_peaks:
-        size = float(np.sqrt(np.mean(place.displacement**2)))
-        for share in (0.03, 0.1, 0.3, 1.0, 3.0) if isinstance(place.at, Between) else ():
-            k = -place.strength_along(place.displacement - hysteresis(place.displacement, share * size))
-            for part in (0.5, 1.0) if k > 0 else ():
-                yield {**place_values(place.at), "stiffness": part * k, "yield_displacement": share * size}
+def _slip_starts(place: ForceAndMotion) -> Iterator[dict[str, float]]:
+    for share in (0.03, 0.1, 0.3, 1.0, 3.0) if isinstance(place.at, Between) else ():
+        limit = share * _rms(place.displacement)
+        k = -place.strength_along(place.displacement - hysteresis(place.displacement, limit))
+        yield from ({"stiffness": part * k, "yield_displacement": limit} for part in (0.5, 1.0) if k > 0)
 
 
 def _with_slip(rig: Rig, _: object, v: dict[str, Any]) -> Rig:
@@ -333,7 +328,7 @@ JOINT_SLIP = Kind(
     path="structure",
     parameters=BOUC_WEN.parameters,
     apply=_with_slip,
-    starts=_slip_starts,
+    starts=_at_peaks(_slip_starts),
     targets=lambda rig: (None,) if isinstance(rig.modes.domain, NamedPoints) and any(rig.modes.domain.pairs()) else (),
     nonlinear=True,
     simpler=_as_stiffness_loss,
@@ -343,15 +338,17 @@ JOINT_SLIP = Kind(
 # --- two_way_friction
 
 
-def _two_way_starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
-    for place in reconstruction.at_peaks:
-        speed = float(np.sqrt(np.mean(place.velocity**2)))
-        for share in (0.02, 0.1, 0.3):
-            basis = np.column_stack([np.tanh(place.velocity / (share * speed)), np.ones(place.velocity.size)])
-            force, offset = -np.linalg.lstsq(basis, place.force, rcond=None)[0]
-            if force > abs(offset):
-                both = {"force_forward": force + offset, "force_backward": force - offset}
-                yield {**place_values(place.at), **both, "smoothing_speed": share * speed}
+def _two_way_starts(place: ForceAndMotion) -> Iterator[dict[str, float]]:
+    for speed in np.array([0.02, 0.1, 0.3]) * _rms(place.velocity):
+        basis = np.column_stack([np.tanh(place.velocity / speed), np.ones(place.velocity.size)])
+        force, offset = -np.linalg.lstsq(basis, place.force, rcond=None)[0]
+        if force > abs(offset):
+            yield _two_way_values(force, offset, float(speed))
+
+
+def _two_way_values(force: float, offset: float, speed: float) -> dict[str, float]:
+    """Values of direction-dependent friction of a mean force and half the difference of both directions, N."""
+    return {"force_forward": force + offset, "force_backward": force - offset, "smoothing_speed": speed}
 
 
 def _force_and_offset(v: Mapping[str, Any]) -> tuple[float, float]:
@@ -360,10 +357,8 @@ def _force_and_offset(v: Mapping[str, Any]) -> tuple[float, float]:
 
 
 def _as_coulomb_friction(friction: Effect, _: Rig) -> tuple[Effect, ...]:
-    numbers = {
-        "force": _force_and_offset(friction.values)[0],
-        "smoothing_speed": friction.values["smoothing_speed"],
-    }
+    force, _offset = _force_and_offset(friction.values)
+    numbers = {"force": force, "smoothing_speed": friction.values["smoothing_speed"]}
     return (Effect(COULOMB_FRICTION, None, {**place_values(friction.at), **numbers}),)
 
 
@@ -387,24 +382,22 @@ TWO_WAY_FRICTION = Kind(
         positive("smoothing_speed", "m/s", Scales.of(rig).speed),
     ),
     apply=lambda rig, _, v: with_element(rig, _two_way_element(v)),
-    starts=_two_way_starts,
+    starts=_at_peaks(_two_way_starts),
     nonlinear=True,
     simpler=_as_coulomb_friction,
     force_laws={"velocity": _two_way_law},
     numbers=_stated_numbers,
     without_negligible=_with_negligible_speed,
-    phrase="Coulomb friction that differs between the two directions",
+    phrase="direction-dependent Coulomb friction",
 )
 
 
 # --- quadratic_damper
 
 
-def _quadratic_starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
-    for place in reconstruction.at_peaks:
-        c = place.strength_along(np.abs(place.velocity) * place.velocity)
-        for share in (0.4, 1.0, 2.5) if c > 0 else ():
-            yield {**place_values(place.at), "coefficient": share * c}
+def _quadratic_starts(place: ForceAndMotion) -> list[dict[str, float]]:
+    c = place.strength_along(np.abs(place.velocity) * place.velocity)
+    return [{"coefficient": share * c} for share in (0.4, 1.0, 2.5) if c > 0]
 
 
 QUADRATIC_DAMPER = Kind(
@@ -415,10 +408,10 @@ QUADRATIC_DAMPER = Kind(
         positive("coefficient", "N s^2/m^2", Scales.of(rig).damping / Scales.of(rig).speed, neutral=0.0),
     ),
     apply=lambda rig, _, v: with_element(rig, PowerDamper(place_of(v), v["coefficient"], 1.0, 2.0)),
-    starts=_quadratic_starts,
+    starts=_at_peaks(_quadratic_starts),
     nonlinear=True,
     force_laws={"velocity": lambda v, u: -v["coefficient"] * np.abs(u) * u},
-    phrase="a damper quadratic in velocity",
+    phrase="a quadratic damper",
 )
 
 KINDS = (
@@ -446,14 +439,12 @@ def _power_force(v: Mapping[str, Any], motion: Floats) -> Floats:
 
 
 def _power_law(element: type, name: str, motion: str, words: str, *, even: bool = False) -> Kind:
-    def starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
-        for place in reconstruction.at_peaks:
-            path = getattr(place, motion)
-            rms = float(np.sqrt(np.mean(path**2)))
-            for exponent in EXPONENTS if rms > 0 else ():
-                basis = (1.0 if even else np.sign(path)) * np.abs(path / rms) ** exponent
-                force = place.strength_along(basis)
-                yield {**place_values(place.at), "force_at_rms": force, "exponent": exponent, "rms": rms}
+    def starts(place: ForceAndMotion) -> Iterator[dict[str, float]]:
+        path = getattr(place, motion)
+        rms = _rms(path)
+        for exponent in EXPONENTS if rms > 0 else ():
+            basis = (1.0 if even else np.sign(path)) * np.abs(path / rms) ** exponent
+            yield {"force_at_rms": place.strength_along(basis), "exponent": exponent, "rms": rms}
 
     return Kind(
         name=name,
@@ -464,7 +455,7 @@ def _power_law(element: type, name: str, motion: str, words: str, *, even: bool 
             Parameter("exponent", "", 1.0, 9.0),
         ),
         apply=lambda rig, _, v: with_element(rig, element(place_of(v), v["force_at_rms"], v["rms"], v["exponent"])),
-        starts=starts,
+        starts=_at_peaks(starts),
         nonlinear=True,
         phrase=words,
         force_laws={motion: lambda v, u: (1.0 if even else np.sign(u)) * _power_force(v, u)},

@@ -1,6 +1,6 @@
 """Kinds of effects of actuators and sensors."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations, permutations
 from typing import Any
@@ -14,6 +14,7 @@ from workbench.gap.effects.effect import (
     Parameter,
     Reconstruction,
     Scales,
+    Starts,
     place_of,
     place_parameters,
     place_values,
@@ -35,7 +36,6 @@ SLOW_ENTRY = 0.1  # of the rms step between samples: a reading that reaches its 
 LONG_STAY = 6.0
 TURNING_SAMPLES = 2  # longest stay of a motion that reverses slowly
 
-Starts = Callable[[Reconstruction, Any], Iterable[dict[str, Any]]]
 Parameters = Callable[[Rig, Any], tuple[Parameter, ...]]
 Apply = Callable[[Rig, Any, dict[str, Any]], Rig]
 Targets = Callable[[Rig], tuple[str, ...]]
