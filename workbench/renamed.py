@@ -7,6 +7,7 @@ from warnings import warn
 
 P = ParamSpec("P")
 R = TypeVar("R")
+C = TypeVar("C", bound=type)
 
 
 class Renamed:
@@ -45,5 +46,23 @@ def former_arguments(**new_names: str) -> Callable[[Callable[P, R]], Callable[P,
             return function(*args, **kwargs)
 
         return with_former
+
+    return taking
+
+
+def former_fields(**new_names: str) -> Callable[[C], C]:
+    """A dataclass whose fields have former names too, in its constructor and as attributes.
+
+    Args:
+        new_names: by former name.
+    """
+
+    def taking(owner: C) -> C:
+        owner.__init__ = former_arguments(**new_names)(owner.__init__)  # type: ignore[misc]
+        for old, new in new_names.items():
+            attribute = Renamed(new)
+            attribute.__set_name__(owner, old)
+            setattr(owner, old, attribute)
+        return owner
 
     return taking

@@ -11,7 +11,7 @@ import numpy as np
 
 from workbench.arrays import Floats
 from workbench.records.record import Record
-from workbench.renamed import Renamed, former_arguments
+from workbench.renamed import former_fields
 from workbench.rig.motion import Motion
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Between, Domain, Location, NamedPoints, Rectangle
@@ -220,6 +220,16 @@ class Reconstruction(Protocol):
 Starts = Callable[[Reconstruction, Any], Iterable[dict[str, Any]]]
 
 
+@former_fields(
+    wider="more_general",
+    alone="exclusive",
+    remainder="unpredictable",
+    settled="without_negligible",
+    stands="fixed_place",
+    first="applied_first",
+    last="applied_last",
+    joined="conjunction",
+)
 @dataclass(frozen=True, eq=False, repr=False)
 class Kind:
     """A kind of effect in the catalogue: all that a diagnosis knows of it, from start values to drawings.
@@ -286,9 +296,6 @@ class Kind:
     applied_first: bool = False
     adds_modes: bool = False
     applied_last: bool = False
-    wider, alone, remainder = Renamed("more_general"), Renamed("exclusive"), Renamed("unpredictable")
-    settled, stands = Renamed("without_negligible"), Renamed("fixed_place")
-    first, last, joined = Renamed("applied_first"), Renamed("applied_last"), Renamed("conjunction")
     known: ClassVar[WeakValueDictionary[int, "Kind"]] = WeakValueDictionary()  # by identity: none is equal to another
 
     def __post_init__(self) -> None:
@@ -303,18 +310,7 @@ class Kind:
         return self.phrase or self.name.replace("_", " ")
 
 
-Kind.__init__ = former_arguments(  # type: ignore[method-assign]
-    wider="more_general",
-    alone="exclusive",
-    remainder="unpredictable",
-    settled="without_negligible",
-    stands="fixed_place",
-    first="applied_first",
-    last="applied_last",
-    joined="conjunction",
-)(Kind.__init__)
-
-
+@former_fields(deviations="std")
 @dataclass(frozen=True, eq=False)
 class Effect:
     """An effect with values of its parameters.
@@ -330,8 +326,6 @@ class Effect:
     target: Any
     values: dict[str, Any]
     std: dict[str, float] = field(default_factory=dict)
-
-    deviations = Renamed("std")
 
     def apply(self, rig: Rig) -> Rig:
         """The rig with the effect."""
@@ -390,9 +384,6 @@ class Effect:
         """Name of the kind with its target."""
         names = ", ".join(self.target) if type(self.target) is tuple else self.target
         return f"{self.kind.name}[{names}]" if isinstance(names, str | int) else self.kind.name
-
-
-Effect.__init__ = former_arguments(deviations="std")(Effect.__init__)  # type: ignore[method-assign]
 
 
 def names_in(target: Any) -> tuple[str, ...]:
@@ -469,19 +460,25 @@ def with_two_as_one(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
     for one, other in combinations(effects, 2):
         if one.kind is other.kind and one.target == other.target and one.at is not None:
             rest = [effect for effect in effects if effect is not one and effect is not other]
+            names = [name for name in COORDINATES if isinstance(one.values.get(name), float)]
+            middle = {name: 0.5 * (one.values[name] + other.values[name]) for name in names}
             yield (*rest, one)
             yield (*rest, one.moved_to(other.at))
-            names = [name for name in COORDINATES if isinstance(one.values.get(name), float)]
-            if names:
-                middle = {name: 0.5 * (one.values[name] + other.values[name]) for name in names}
+            if middle:
                 yield (*rest, replace(one, values={**one.values, **middle}))
+
+
+def _with_one_replaced(
+    effects: Sequence[Effect], others: Callable[[Effect], Iterable[Effect]]
+) -> Iterator[tuple[Effect, ...]]:
+    """The sets with one effect replaced by each of the others of it."""
+    for i, effect in enumerate(effects):
+        yield from ((*effects[:i], other, *effects[i + 1 :]) for other in others(effect))
 
 
 def with_one_simpler(effects: Sequence[Effect], rig: Rig) -> Iterator[tuple[Effect, ...]]:
     """The sets with one effect replaced by a limiting case."""
-    for i, effect in enumerate(effects):
-        for simpler in simpler_forms(effect, rig):
-            yield (*effects[:i], simpler, *effects[i + 1 :])
+    return _with_one_replaced(effects, lambda effect: simpler_forms(effect, rig))
 
 
 def each_left_out(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
@@ -492,9 +489,7 @@ def each_left_out(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
 
 def more_general_sets(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
     """The sets with one effect replaced by one that it is a limiting case of."""
-    for i, effect in enumerate(effects):
-        for more_general in effect.kind.more_general(effect):
-            yield (*effects[:i], more_general, *effects[i + 1 :])
+    return _with_one_replaced(effects, lambda effect: effect.kind.more_general(effect))
 
 
 def merged_sets(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
@@ -507,9 +502,7 @@ def merged_sets(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
 
 def from_other_starts(effects: Sequence[Effect], rig: Rig) -> Iterator[tuple[Effect, ...]]:
     """The sets with one effect at other start values, where its fit may end in another minimum."""
-    for i, effect in enumerate(effects):
-        for other in effect.kind.other_starts(effect, rig):
-            yield (*effects[:i], other, *effects[i + 1 :])
+    return _with_one_replaced(effects, lambda effect: effect.kind.other_starts(effect, rig))
 
 
 def simpler_sets(effects: Sequence[Effect], rig: Rig) -> Iterator[tuple[Effect, ...]]:

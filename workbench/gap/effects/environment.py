@@ -70,8 +70,7 @@ def _periodic_starts(reconstruction: Reconstruction, _: object) -> Iterator[dict
         frequency, amplitude, phase = tone(mean, sample_time)
         lead = records[0].start_time - reconstruction.data.records[0].start_time
         if lead:  # the phase refers to the start of the record
-            turned = 2.0 * np.pi * frequency * lead
-            phase = float(np.angle(np.exp(1j * (phase - turned))))
+            phase = float(np.angle(np.exp(1j * (phase - 2.0 * np.pi * frequency * lead))))
         if not _is_distortion(frequency, reconstruction.data.records):
             yield {**place_values(place.at), "frequency": frequency, "amplitude": amplitude, "phase": phase}
 

@@ -154,7 +154,6 @@ class IdentifiedPrior:
 
 
 def _parameters(rig: Rig, prior: NominalPrior | IdentifiedPrior) -> tuple[Parameter, ...]:
-    """The parameters of the nominal errors of a rig."""
     if isinstance(prior, IdentifiedPrior):
         free = range(1, prior.root.shape[1] + 1)
         return tuple(Parameter(f"identified_{k}", "", -BOUND, BOUND, prior_std=1.0) for k in free)
@@ -184,9 +183,8 @@ def _each_parameter(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
         elastic = (r for r in modes if rig.modes.omega[r - 1] > 0)
         yield from (with_prior(f"frequency_{r}", prior.frequency, PROFILE_UNIT) for r in elastic)
     if prior.coupling:
-        yield from (
-            with_prior(name, prior.coupling, PROFILE_UNIT) for name, *_ in _couplings(rig.modes.omega.tobytes())
-        )
+        couplings = _couplings(rig.modes.omega.tobytes())
+        yield from (with_prior(name, prior.coupling, PROFILE_UNIT) for name, *_ in couplings)
     if prior.damping:
         yield from (with_prior(f"damping_{r}", prior.damping, RATIO_UNIT) for r in modes)
     if prior.delay:
@@ -195,14 +193,10 @@ def _each_parameter(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
             high = 0.0 if sensor.name in prior.early else LARGEST_DELAY
             yield with_prior(f"delay_{sensor.name}", prior.delay, DELAY_UNIT, low, high, sensor.name)
     # a transducer, and the sensor that alone reads its errors
-    transducers: list[tuple[Transducer, str]] = [
-        *((actuator, "") for actuator in rig.actuators),
-        *((sensor, sensor.name) for sensor in rig.sensors),
-    ]
+    transducers: list[tuple[Transducer, str]] = [(actuator, "") for actuator in rig.actuators]
+    transducers += [(sensor, sensor.name) for sensor in rig.sensors]
     if prior.gain:
-        yield from (
-            with_prior(_gain_name(transducer), prior.gain, PROFILE_UNIT, sensor=own) for transducer, own in transducers
-        )
+        yield from (with_prior(_gain_name(each), prior.gain, PROFILE_UNIT, sensor=own) for each, own in transducers)
     if prior.place:
         for transducer, own in transducers:
             for name, low, high in zip(_place_names(rig, transducer), *_place_bounds(rig, transducer), strict=True):
@@ -225,6 +219,7 @@ def _with_variation(profile: Profile, amplitudes: np.ndarray, length: float) -> 
     )
 
 
+@solved_once
 def _with_profile_errors(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> Rig:
     """The rig with errors of its profiles, or of its modal mass."""
     stiffness, mass = (np.array(list(in_group(values, group).values())) for group in ("stiffness", "mass"))
@@ -246,15 +241,13 @@ def _with_profile_errors(rig: Rig, prior: NominalPrior, values: dict[str, float]
     return replace(rig, structure=structure, modes=structure.modes(modes.n_modes, tolerance=RESOLUTION))
 
 
-_profiles_solved = solved_once(_with_profile_errors)
-
-
+@solved_once
 def _with_structural_errors(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> Rig:
     """The rig with errors of its structure and modes; only those of profiles require new modes."""
     along = in_group(values, "stiffness", "mass")
     if not isinstance(rig.structure, Structure):
         rig = replace(rig, structure=None)  # later effects must change these modes, not solve the structure again
-    rig = _profiles_solved(rig, prior, along)
+    rig = _with_profile_errors(rig, prior, along)
     if prior.coupling:
         rig = replace(rig, modes=_with_couplings(rig.modes, values))
     structure, modes = rig.structure, rig.modes
@@ -302,9 +295,6 @@ def _with_couplings(modes: Modes, values: dict[str, float]) -> Modes:
     return replace(modes, shapes=lambda located, derivative: shapes(located, derivative) @ turn)
 
 
-_structure_solved = solved_once(_with_structural_errors)
-
-
 def _with_errors(rig: Rig, prior: NominalPrior | IdentifiedPrior, values: dict[str, float]) -> Rig:
     """The rig with all nominal errors: of its structure, modes, transducers and between records."""
     if isinstance(prior, IdentifiedPrior):
@@ -313,18 +303,15 @@ def _with_errors(rig: Rig, prior: NominalPrior | IdentifiedPrior, values: dict[s
         if modes.n_modes < kept and made.structure is not None:  # an effect has added modes to the rig
             modes = modes_of(made.structure, kept)
         return replace(rig, modes=modes, structure=made.structure, actuators=made.actuators)
-    rig = _structure_solved(
-        rig, prior, {name: value for name, value in values.items() if group_of(name) not in OUTSIDE}
-    )
+    inside = {name: value for name, value in values.items() if group_of(name) not in OUTSIDE}
+    rig = _with_structural_errors(rig, prior, inside)
     rig = differing(rig, prior.parameter, deviations_of(values))
     transducers: tuple[Transducer, ...] = (*rig.actuators, *rig.sensors)
     units = _shape_units(rig.modes, transducers) if prior.shape else np.zeros((len(transducers), 0))
     if prior.shape and prior.points:
         rig = replace(rig, modes=_modes_with_errors(rig.modes, transducers, prior.points, values))
-    off = [
-        _transducer_with_errors(rig, transducer, unit, prior, values)
-        for transducer, unit in zip(transducers, units, strict=True)
-    ]
+    each = zip(transducers, units, strict=True)
+    off = [_transducer_with_errors(rig, transducer, unit, prior, values) for transducer, unit in each]
     if all(one is other for one, other in zip(transducers, off, strict=True)):
         return rig
     n = len(rig.actuators)
@@ -348,15 +335,7 @@ def _modes_with_errors(
 def _transducer_with_errors(
     rig: Rig, transducer: Any, units: Floats, prior: NominalPrior, values: dict[str, float]
 ) -> Any:
-    """An actuator or a sensor with errors of its place, gain, mode shapes and timing.
-
-    Args:
-        rig: with the modes.
-        transducer: actuator or sensor.
-        units: (n_modes,) units of the shape errors.
-        prior: of the errors.
-        values: of the errors, by name.
-    """
+    """An actuator or a sensor with errors of its place, gain, shapes and timing; units: (n_modes,) of the shapes."""
     changes: dict[str, Any] = {}
     if prior.place:
         errors = tuple([values.get(name, 0.0) for name in _place_names(rig, transducer)])  # shares of the extent
@@ -402,10 +381,8 @@ def _shape_units(modes: Modes, transducers: tuple[Transducer, ...]) -> Floats:
 
     Cached: not to be written to.
     """
-    shapes, kinds = (
-        np.array([shape_of(modes, transducer) for transducer in transducers]),
-        [derivative_of(transducer) for transducer in transducers],
-    )
+    shapes = np.array([shape_of(modes, transducer) for transducer in transducers])
+    kinds = [derivative_of(transducer) for transducer in transducers]
     rms = {kind: np.sqrt((shapes[np.array(kinds) == kind] ** 2).mean(axis=0)) for kind in set(kinds)}
     return np.array([rms[kind] for kind in kinds])
 
@@ -441,7 +418,7 @@ def parted(errors: Effect) -> tuple[Effect, Effect | None]:
         return errors, None
     between = in_group(errors.values, "record")
     alike = {name: value for name, value in errors.values.items() if name not in between}
-    others: dict[str, Any] = {group: 0.0 for group in prior.groups if group != "record"}
+    others: dict[str, Any] = dict.fromkeys(set(prior.groups) - {"record"}, 0.0)
     return (
         replace(errors, target=replace(prior, record=0.0), values=alike),
         replace(errors, target=replace(prior, **others), values=between),
@@ -459,13 +436,7 @@ def _values_by_mode(values: dict[str, float], group: str, n_modes: int) -> Float
 
 
 def nominal_errors(rig: Rig, prior: NominalPrior | IdentifiedPrior, start: Mapping[str, float] | None = None) -> Effect:
-    """Nominal errors as an effect, to be fitted jointly with others.
-
-    Args:
-        rig: nominal.
-        prior: of the errors.
-        start: start values by name; all others are zero.
-    """
+    """Nominal errors as an effect, to be fitted jointly with others; start: values by name, all others zero."""
     values = {p.name: float(np.clip((start or {}).get(p.name, 0.0), p.low, p.high)) for p in _parameters(rig, prior)}
     return Effect(NOMINAL_ERRORS, prior, values)
 
@@ -506,12 +477,9 @@ def varying_parameters(rig: Rig) -> tuple[str, ...]:
 
 
 def differing(rig: Rig, parameter: str, deviations: Mapping[str, float]) -> Rig:
-    """The rig with a parameter that varies from record to record.
+    """The rig with a parameter, of `varying_parameters`, that varies from record to record.
 
-    Args:
-        rig: nominal.
-        parameter: the parameter, of `varying_parameters`.
-        deviations: by name of record: relative for the stiffness, over the buckling load for the axial load.
+    deviations: by name of record: relative for the stiffness, over the buckling load for the axial load.
     """
 
     def change(deviation: float) -> OfOneRecord:

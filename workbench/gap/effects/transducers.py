@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from workbench.arrays import Floats
 from workbench.gap.effects.effect import (
     ALL,
     Effect,
@@ -101,8 +102,8 @@ def exchanged_last(effects: Sequence[Effect]) -> tuple[Effect, ...]:
     """
     ordered = list(effects)
     for exchange in [e for e in effects if e.kind in (SWAPPED_INPUTS, SWAPPED_OUTPUTS)]:
-        at, (one, other) = ordered.index(exchange), exchange.target
-        names = {one: other, other: one}
+        at = ordered.index(exchange)
+        names = dict(zip(exchange.target, exchange.target[::-1], strict=True))
         later = [e for e in ordered[at + 1 :] if e.kind.path == exchange.kind.path and not e.kind.applied_first]
         if any(isinstance(e.target, tuple) for e in later):  # such an effect may involve both channels, so it stays
             continue
@@ -326,12 +327,9 @@ def _actuator_crosstalk_starts(reconstruction: Reconstruction, pair: tuple[str, 
     alike = float(own @ source) ** 2 > (1.0 - LEAST_OWN) * size * float(source @ source)
     if not source.any() or (size > 0 and alike):
         return []
-    noise = np.array(list(_noise(reconstruction.rig).values()))[:, None]
+    noise = np.array([*_noise(reconstruction.rig).values()])[:, None]
     change = np.concatenate([(y / noise).ravel() for y in _responses_to_share(reconstruction, pair)])
-    residual = np.concatenate([(y / noise).ravel() for y in reconstruction.residuals])
-    power = float(change @ change)
-    share = float(residual @ change) / power if power > 0 else 0.0
-    return [{"share": share}] if share**2 * power > LEAST_CROSSTALK * float(residual @ residual) else []
+    return _share_start(np.concatenate([(y / noise).ravel() for y in reconstruction.residuals]), change)
 
 
 def _with_share(rig: Rig, pair: tuple[str, str], share: float) -> Rig:
@@ -490,10 +488,14 @@ def _predicted(reconstruction: Reconstruction, name: str) -> np.ndarray:
 
 def _crosstalk_starts(reconstruction: Reconstruction, pair: tuple[str, str]) -> list[dict[str, float]]:
     """Share of the second sensor's prediction in the residual of the first, if that explains enough of it."""
-    residual, source = _residual(reconstruction, pair[0]), _predicted(reconstruction, pair[1])
-    size = float(source @ source)
-    share = float(residual @ source) / size if size > 0 else 0.0
-    return [{"share": share}] if share**2 * size > LEAST_CROSSTALK * float(residual @ residual) else []
+    return _share_start(_residual(reconstruction, pair[0]), _predicted(reconstruction, pair[1]))
+
+
+def _share_start(residual: Floats, response: Floats) -> list[dict[str, float]]:
+    """The least-squares share of a response in a residual, if it explains enough of it."""
+    power = float(response @ response)
+    share = float(residual @ response) / power if power > 0 else 0.0
+    return [{"share": share}] if share**2 * power > LEAST_CROSSTALK * float(residual @ residual) else []
 
 
 def _noise(rig: Rig) -> dict[str, float]:
@@ -553,14 +555,10 @@ def clipped_level(rows: list[np.ndarray]) -> float | None:
 
 
 def _comes_to_rest(rows: list[np.ndarray], at_top: list[np.ndarray]) -> bool:
-    """Whether readings come to rest, or reverse, at their top instead of being cut off there.
+    """Whether readings (n_samples,) come to rest, or reverse, where they are `at_top` instead of being cut off there.
 
     A motion that comes to rest slows down first, and stays longer than its deceleration would have taken it up and
     back. A motion that a controller repeats reverses at the same top and hardly stays there.
-
-    Args:
-        rows: readings (n_samples,) of each record.
-        at_top: (n_samples,) of each record, whether the reading is at its top.
     """
     entering, at_rest = [], []
     for row, flags in zip(rows, at_top, strict=True):

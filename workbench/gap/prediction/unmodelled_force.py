@@ -104,9 +104,8 @@ def force_filter(
 ) -> ForceFilter:
     """The filter for forces along `patterns` (n_modes, n_forces) with the given process variances.
 
-    Args:
-        colour: (n_stages, n_stages) transition of each force's shaping filter, from the force itself to the last stage,
-            which white noise drives; see `colour_of`.
+    colour: (n_stages, n_stages) transition of each force's shaping filter, from the force itself to the last stage,
+    which white noise drives; see `colour_of`.
     """
     n_state, m = model.transition.shape[0], patterns.shape[1]
     forces = n_state + len(colour) * m
@@ -150,14 +149,7 @@ def wandering_force_filter(
 ) -> ForceFilter:
     """The filter for one force that is an Ornstein-Uhlenbeck process, discretised exactly.
 
-    Forces of contact and friction vary within a sample too.
-
-    Args:
-        modes, model: of the rig, and its sampled form.
-        shape: (n_modes,) of the modes at the force.
-        rms: of the force, N.
-        correlation_time: s.
-        sample_time: s.
+    Forces of contact and friction vary within a sample too. shape: (n_modes,) at the force; rms, N; times, s.
     """
     n = modes.n_modes
     size = 2 * n + 1
@@ -264,8 +256,8 @@ def whiten(filter_: ForceFilter, residual: Floats) -> Floats:
 def _of_unit_covariance(filter_: ForceFilter, errors: Floats) -> Floats:
     """Innovations (n_sensors, n_samples) scaled to unit covariance."""
     # innovations that have diverged may be nan, and stay so
-    white: Floats = solve_triangular(np.linalg.cholesky(filter_.innovation), errors, lower=True, check_finite=False)
-    return white
+    root = np.linalg.cholesky(filter_.innovation)
+    return np.asarray(solve_triangular(root, errors, lower=True, check_finite=False))
 
 
 def smoothed_states(filter_: ForceFilter, residual: Floats) -> Floats:
@@ -289,5 +281,4 @@ def smoothed_covariance(filter_: ForceFilter) -> Floats:
     h, p = filter_.h, filter_.covariance
     closed = filter_.a - filter_.gain @ h
     adjoint = accumulated(closed.T, h.T @ np.linalg.solve(filter_.innovation, h))
-    smoothed: Floats = p - p @ adjoint @ p
-    return smoothed
+    return np.asarray(p - p @ adjoint @ p)
