@@ -143,20 +143,11 @@ Receptances = UncoupledReceptances | CoupledReceptances
 
 def real_product(one: Complexes, other: Complexes) -> Floats:
     """Sum over lines of positive and negative frequency: 2 Re(oneᴴ other)."""
-    product: Floats = 2.0 * (one.real.T @ other.real + one.imag.T @ other.imag)
-    return product
+    return np.asarray(2.0 * (one.real.T @ other.real + one.imag.T @ other.imag))
 
 
 def receptances_of(rig: Rig, model: SampledModel, omega: Floats, n_samples: int, sample_time: float) -> Receptances:
-    """The receptances of a rig at spectral lines of a record.
-
-    Args:
-        rig: with the modes.
-        model: its sampled form, with the variance of each sensor's noise.
-        omega: (n_lines,) rad/s.
-        n_samples: of the record.
-        sample_time: s.
-    """
+    """The receptances of a rig, and of its sampled form, at spectral lines (n_lines,), rad/s, of a record."""
     z = (1.0 + abs(UNDAMPED)) * np.exp(1j * omega * sample_time)
     turn = _uncoupled if rig.modes.proportional else _coupled
     return turn(rig, model, np.asarray(1j * omega, complex), z, np.sqrt(model.noise_variance), 1.0 / np.sqrt(n_samples))
@@ -282,9 +273,7 @@ class Lines:
     def _transient(self, u: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Least-squares state d of the transient given a force, and the right-hand side of its normal equations.
 
-        Args:
-            u: T projected on the directions of the force.
-            a: the residual, likewise.
+        u, a: T and the residual, projected on the directions of the force.
         """
         own, along = self._products
         along = along - real_product(u, a)
@@ -332,14 +321,7 @@ def _moving_sum(values: np.ndarray) -> np.ndarray:
 
 
 def lines_of(rig: Rig, model: SampledModel, residuals: Sequence[np.ndarray], sample_time: float) -> list[Lines]:
-    """The spectral lines of every record's residual.
-
-    Args:
-        rig: nominal.
-        model: its sampled form, with the variance of each sensor's noise.
-        residuals: (n_sensors, n_samples) a record, in the sensors' units.
-        sample_time: s.
-    """
+    """The spectral lines of every record's residual (n_sensors, n_samples), in the sensors' units."""
     noise = np.sqrt(model.noise_variance)
     made: dict[int, tuple[np.ndarray, list[Receptances]]] = {}
     lines = []

@@ -71,9 +71,7 @@ def locate_force(reconstruction: ForceReconstruction) -> ForceLocation:
 
     One sensor locates nothing, since a force anywhere explains its readings. Sensors with a lag are left out.
     """
-    reconstruction = reconstruction.without(
-        [sensor.name for sensor in reconstruction.rig.sensors if sensor.time_constant > 0]
-    )
+    reconstruction = reconstruction.without([s.name for s in reconstruction.rig.sensors if s.time_constant > 0])
     domain, places = reconstruction.domain, reconstruction.places
     at: Any = reconstruction.peaks[0]
     if len(reconstruction.rig.sensors) < 2:
@@ -92,29 +90,23 @@ def locate_force(reconstruction: ForceReconstruction) -> ForceLocation:
         informative = reconstruction.informative(at)
         profile = reconstruction.screened(places, informative)
     else:
-        ranked = [
-            places[i] for i in np.argsort(-reconstruction.profile, kind="stable") if isinstance(places[i], Between)
-        ]
-        points = [where for where in places if not isinstance(where, Between)]
-        places = [*points, *ranked[: LOCALISATION.pairs_shown]]
+        ranked = [places[i] for i in np.argsort(-reconstruction.profile, kind="stable")]
+        pairs = [where for where in ranked if isinstance(where, Between)][: LOCALISATION.pairs_shown]
+        places = [*(where for where in places if not isinstance(where, Between)), *pairs]
         profile = reconstruction.misfits(places, informative)
         at, std = places[int(np.argmin(profile))], 0.0
     lowest = min(reconstruction.misfit(at, informative), profile.min())
     degrees_of_freedom = sum(each.degrees_of_freedom for each in reconstruction.lines)
     left = reconstruction.misfit(at) / max(degrees_of_freedom, 1) - 1.0
     std *= np.sqrt(max(left, 0.0) + 1.0)
-    return ForceLocation(
-        places, -0.5 * (profile - lowest), at, std, *_explained(reconstruction, degrees_of_freedom, left)
-    )
+    explained = _explained(reconstruction, degrees_of_freedom, left)
+    return ForceLocation(places, -0.5 * (profile - lowest), at, std, *explained)
 
 
 def _explained(reconstruction: ForceReconstruction, degrees_of_freedom: int, left: float) -> tuple[float, bool | None]:
     """Share of the gap's power that one force explains, and whether that is all of it; None if it cannot be tested.
 
-    Args:
-        reconstruction: of the nominal rig.
-        degrees_of_freedom: of the residual given the force.
-        left: its power above the noise, in units of the noise power.
+    left: power of the residual given the force, above the noise, in units of the noise power.
     """
     values = 2 * sum(each.left.size for each in reconstruction.lines)
     gap = sum(each.power for each in reconstruction.lines) - values

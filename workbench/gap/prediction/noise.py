@@ -191,7 +191,7 @@ def logging_noise_power(rig: Rig, data: FitData) -> np.ndarray:
     so_far = (answers**2).cumsum(axis=2)  # (n_inputs, n_outputs, n_samples)
     by_input = [so_far[:, :, : record.n_samples].mean(axis=2) for record in data.counted]
     each = zip(data.counted, by_input, strict=True)
-    return np.asarray([(record.inputs**2).mean(axis=1) @ power for record, power in each]) / data.noise**2
+    return np.asarray([(record.inputs**2).mean(axis=1) @ power / data.noise**2 for record, power in each])
 
 
 def loudest_logging_noise(rig: Rig, data: FitData) -> np.ndarray:

@@ -84,11 +84,10 @@ def band_misfit(measured: Spectra, simulated: Spectra, factor: float = 1.0) -> F
     A missing effect shifts resonances and changes the amplitudes of some bands, up or down; a fault of the set-up
     changes all bands alike.
     """
-    tiny = 1e-300
     with np.errstate(over="ignore", invalid="ignore"):
         of_y, of_p, both = measured.power, simulated.power, measured.cross_power(simulated)
-        ratio = 0.5 * (np.log(np.maximum(of_y, tiny)) - np.log(np.maximum(of_p * factor**2, tiny)))
-        correlation = np.sign(factor) * both / np.sqrt(np.maximum(of_y * of_p, tiny))
+        ratio = 0.5 * (np.log(np.maximum(of_y, 1e-300)) - np.log(np.maximum(of_p * factor**2, 1e-300)))
+        correlation = np.sign(factor) * both / np.sqrt(np.maximum(of_y * of_p, 1e-300))
         misfit = np.minimum(np.abs(ratio), LARGEST_LOG_RATIO) + 1.0 - correlation
         return np.asarray(np.nan_to_num(misfit, nan=LARGEST_LOG_RATIO + 1.0))
 
@@ -131,7 +130,7 @@ class Comparison:
         """The comparison of a rig with records; simulated: the simulations, if they are known."""
         measured = [record.outputs[:, lead_of(record, transient) :] for record in records]
         if simulated is None:
-            simulated = _compared_samples(measured, [simulated_by(rig, record) for record in records])
+            simulated = _simulated(rig, records, measured)
         power = sum((y**2).sum(axis=1) for y in measured) / sum(y.shape[1] for y in measured)
         scale = np.where(power > 0, power, 1.0)
         noise = np.array([s.noise_std for s in rig.sensors]) ** 2 / scale
@@ -226,7 +225,7 @@ class Comparison:
 
     def simulated_with(self, rig: Rig, records: Sequence[Record]) -> list[Floats]:
         """Readings (n_outputs, n_samples) of another rig for other records, at the samples that are compared."""
-        return _compared_samples(self.measured, [simulated_by(rig, record) for record in records])
+        return _simulated(rig, records, self.measured)
 
     def residual_power(self, simulated: Sequence[Floats]) -> Floats:
         """Mean square residual (n_outputs,) of simulations, as a share of the mean square measured."""
@@ -237,15 +236,12 @@ class Comparison:
     def closed(self, after: np.ndarray) -> np.ndarray:
         """Share (n_outputs,) of the residual power beyond the noise that is removed.
 
-        It counts as 0 if much of the signal remains, or if most of the signal is noise.
-
-        Args:
-            after: (n_outputs,) residual power after a correction.
+        It counts as 0 if much of the signal remains, or if most of the signal is noise. after: (n_outputs,) residual
+        power after a correction.
         """
         left = np.maximum(after - self.noise, 0.0)
-        return np.where(
-            (left > LARGEST_LEFT) | (self.noise > NOISY), 0.0, 1.0 - left / np.maximum(self.before - self.noise, 1e-300)
-        )
+        closed = 1.0 - left / np.maximum(self.before - self.noise, 1e-300)
+        return np.where((left > LARGEST_LEFT) | (self.noise > NOISY), 0.0, closed)
 
     def closes(self, rig: Rig, records: Sequence[Record]) -> float:
         """The share that a corrected rig and records close: the median over channels with a wide gap."""
@@ -253,9 +249,9 @@ class Comparison:
         return float(np.median(self.closed(after)[self.wide]))
 
 
-def _compared_samples(measured: Sequence[Floats], simulated: Sequence[Floats]) -> list[Floats]:
-    """The last samples of each simulation, as many as are measured after the transient."""
-    return [p[:, p.shape[1] - y.shape[1] :] for y, p in zip(measured, simulated, strict=True)]
+def _simulated(rig: Rig, records: Sequence[Record], measured: Sequence[Floats]) -> list[Floats]:
+    """The last samples of the simulation of each record, as many as are measured after the transient."""
+    return [simulated_by(rig, r)[:, r.n_samples - y.shape[1] :] for r, y in zip(records, measured, strict=True)]
 
 
 def simulated_by(rig: Rig, record: Record) -> Floats:

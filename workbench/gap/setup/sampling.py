@@ -80,22 +80,15 @@ def modal_units(gap: Comparison) -> list[SetupFault]:
         for factor, words in ((TURN, "Hz where rad/s is"), (1.0 / TURN, "rad/s where Hz is")):
             sentence = f"The natural frequencies look like {words} meant: multiply them by {factor:.6g}."
             candidates.append(("frequency", sentence, partial(modes_times, factor, 1.0)))
-    faults = [
-        SetupFault(kind, sentence, gap.closes(*correction(rig, records)), correction)
-        for kind, sentence, correction in candidates
-    ]
-    faults = [fault for fault in faults if fault.closes >= CLOSED]
-    return sorted(faults, key=lambda fault: -fault.closes)[:1]
+    faults = [SetupFault(kind, what, gap.closes(*by(rig, records)), by) for kind, what, by in candidates]
+    return sorted((fault for fault in faults if fault.closes >= CLOSED), key=lambda fault: -fault.closes)[:1]
 
 
 def late_records(gaps: Sequence[Comparison]) -> list[SetupFault]:
     """Faults of records that are late or early beside others that the same inputs drive, where the delays differ.
 
     A delay is one of all outputs, by which they agree best with the prediction; each of these records must show its
-    own. Where the inputs differ, so may the delays of their actuators.
-
-    Args:
-        gaps: each of one record.
+    own. Where the inputs differ, so may the delays of their actuators. gaps: each of one record.
     """
     driven = [gap for gap in gaps if np.any(gap.records[0].inputs)]
     if not driven:
