@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -115,8 +115,7 @@ def diagnose(
     if seconds is not None and not seconds > 0:
         raise ValueError(f"a search needs time: seconds must be positive; got {seconds:g}")
     sharing = Workers.at_hand() if workers is None else Workers(workers)
-    allowed = None if seconds is None else SEARCH_SHARE * seconds * (2.0 if sharing.number == 1 else 1.0)
-    deadline = Deadline(allowed)
+    deadline = Deadline(None if seconds is None else SEARCH_SHARE * seconds * (2.0 if sharing.number == 1 else 1.0))
     if not records:
         raise ValueError("a diagnosis needs at least one record to fit; got none")
     shortest = min(record.n_samples * record.sample_time for record in (*records, *validation))
@@ -173,32 +172,24 @@ def diagnose(
         disagreeing = _disagreeing(attribution, shrinkage, validation, transient, tolerance, beyond)
         outcome = _outcome(attribution, shrinkage, beyond, disagreeing)
         errors = next((e for e in accounted if e.kind is NOMINAL_ERRORS), None)
-        named = tuple(e for e in accounted if e is not errors)
-        effects = named if outcome in ("none", "explained") else ()
-        faulty = _faulty(attribution.best.effects)
-        as_given = faulty == _faulty(given)
-        budget_for = partial(
-            budget_of,
-            rig,
-            errors=errors,
-            records=validation or records,
-            noise_found=attribution.noise,
-            transient=transient,
-        )
-        budget = budget_for(effects, logged=_input_noise(attribution, outcome))
-        power = _residual_power(rig, (), validation or records, transient) / len(validation or records)
+        effects = tuple(e for e in accounted if e is not errors) if outcome in ("none", "explained") else ()
+        measured = validation or records
+        how: Any = {"noise_found": attribution.noise, "transient": transient}
+        budget = budget_of(rig, effects, errors, measured, logged=_input_noise(attribution, outcome), **how)
+        power = _residual_power(rig, (), measured, transient) / len(measured)
         if outcome == "explained" and _leaves_unexplained(budget, power, tolerance):
             attribution = replace(attribution, outcome="part")
             outcome, effects = _outcome(attribution, shrinkage, beyond, disagreeing), ()
-            budget = budget_for(effects, logged=_input_noise(attribution, outcome))
-        where = break_down(nominal, effects, place() if as_given else locate_force(nominal.without(faulty)))
+            budget = budget_of(rig, effects, errors, measured, logged=_input_noise(attribution, outcome), **how)
+        faulty = _faulty(attribution.best.effects)
+        located = place() if faulty == _faulty(given) else locate_force(nominal.without(faulty))
         verdict = Verdict(
             case=name,
             outcome=outcome,
             disagreeing=disagreeing,
             effects=attribution.best.effects,
             alternatives=tuple((fit.named, probability) for fit, probability in attribution.alternatives),
-            where=where,
+            where=break_down(nominal, effects, located),
             shrinkage=shrinkage,
             corrected=corrected,
             nominal=rig,
@@ -310,10 +301,7 @@ def _input_noise(found: Attribution, outcome: str) -> float:
 def _leaves_unexplained(budget: Budget, power: float, tolerance: float) -> bool:
     """Whether a set leaves more of the gap unexplained than an explanation may, and more than the tolerance.
 
-    Args:
-        budget: of the set.
-        power: mean square of the gap.
-        tolerance: of the signal's rms.
+    power: mean square of the gap.
     """
     least = max(UNEXPLAINED, LARGEST_LEFT * budget.noise)
     return budget.unexplained > least and budget.unexplained * power > tolerance**2
@@ -370,20 +358,14 @@ def _disagreeing(
     noise = beyond + [noise_power(record, found.noise, transient) for record in held_out]
     chance = [CHANCE * np.sqrt(2.0 / (r.n_outputs * (r.n_samples - lead_of(r, transient)))) for r in held_out]
     tolerated = (1.0 - LEAST_CLOSED_WITH_ERRORS) ** 2 if found.best.effects else 0.0
-    least = np.max(
-        [np.full(len(held_out), tolerance**2), (LARGEST_LEFT + np.array(chance)) * noise, tolerated * (before - noise)],
-        axis=0,
-    )
+    least = np.maximum((LARGEST_LEFT + np.array(chance)) * noise, tolerated * (before - noise)).clip(tolerance**2)
     return tuple(record.name for record, is_gap in zip(held_out, after - noise > least, strict=True) if is_gap)
 
 
 def _over_fits(found: Attribution, shrinkage: Shrinkage | None, beyond: float | Floats = 0.0) -> bool:
     """Whether a set that explains the fitted records leaves much of the gap of held-out records: over-fitting.
 
-    Args:
-        found: the attribution.
-        shrinkage: of the gap on held-out records.
-        beyond: (n_records,) of `_power_beyond_effects`.
+    beyond: (n_records,) of `_power_beyond_effects`.
     """
     if shrinkage is None or _unpredictable(found):
         return False
@@ -391,10 +373,9 @@ def _over_fits(found: Attribution, shrinkage: Shrinkage | None, beyond: float | 
     floor = max(found.noise_ratio, 1.0) ** 2 * floor + beyond
     left, closable = (np.maximum(power - floor, 0.0).sum() for power in (after, before))
     closed = max(shrinkage.overall, 1.0 - float(np.sqrt(left / max(closable, 1e-300))))
-    beside = any(effect.kind is NOMINAL_ERRORS for effect in found.best.effects)
-    return bool((after > (1.0 + LARGEST_LEFT) * floor).any()) and closed < (
-        LEAST_CLOSED_WITH_ERRORS if beside else LEAST_CLOSED
-    )
+    has_errors = any(effect.kind is NOMINAL_ERRORS for effect in found.best.effects)
+    least = LEAST_CLOSED_WITH_ERRORS if has_errors else LEAST_CLOSED
+    return bool((after > (1.0 + LARGEST_LEFT) * floor).any()) and closed < least
 
 
 def _unpredictable(found: Attribution) -> bool:

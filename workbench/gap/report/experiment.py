@@ -119,7 +119,8 @@ def _place_of_largest_motion(reconstruction: ForceReconstruction) -> Location:
     power = sum(motion.displacement @ motion.displacement.T for motion in reconstruction.motions)
     places = [where for where in reconstruction.places if not isinstance(where, Between)]
     shapes = reconstruction.rig.modes.phi(places)
-    return same_place(places[int(np.argmax(np.sum((shapes @ power) * shapes, axis=1)))])
+    largest: Location = same_place(places[int(np.argmax(np.sum((shapes @ power) * shapes, axis=1)))])
+    return largest
 
 
 def _by_decades(effect: Effect, rig: Rig) -> Iterator[Effect]:
