@@ -50,7 +50,7 @@ from workbench.threads import one_blas_thread
 LIKELY = 0.01  # probability from which an alternative deserves an experiment
 TOLERANCE = 0.01  # of the signal: a smaller gap is not explained
 WORTH = 0.02  # of the residual power of held-out records: an effect that acts there must remove more to be named
-TRIFLE = 0.0005  # of the gap's power there: likewise
+LEAST_SHARE = 0.0005  # of the gap's power there: likewise
 DECISIVE = 10.0  # times the residual with it: an effect without which more is left there is not refitted without
 LEAST_CLOSED = 0.9  # share of the gap to be closed on held-out records
 LARGEST_LEFT = 0.1  # of the noise power there: a larger residual above the noise is significant
@@ -238,17 +238,17 @@ def _validated(rig: Rig, found: Attribution, held_out: Sequence[Record], transie
     if found.outcome != "explained" or len(named) < 2 or not held_out or _unpredictable(found):
         return found
     after = _residual_power(rig, effects, held_out, transient)
-    trifle = max(WORTH * after, TRIFLE * _residual_power(rig, (), held_out, transient))
+    least = max(WORTH * after, LEAST_SHARE * _residual_power(rig, (), held_out, transient))
     for effect in named:
         rest = [e for e in effects if e is not effect]
         if _power_of_difference(rig, effects, rest, held_out, transient) < WORTH * after:
             continue
         # most effects count decisively even with the others unchanged; else the others are refitted
-        if _residual_power(rig, rest, held_out, transient) < DECISIVE * (after + trifle):
+        if _residual_power(rig, rest, held_out, transient) < DECISIVE * (after + least):
             without = found.without(effect)
             if _errors_are_plausible(effects) and not _errors_are_plausible(without.best.effects):
                 continue
-            if _residual_power(rig, without.best.effects, held_out, transient) < after + trifle:
+            if _residual_power(rig, without.best.effects, held_out, transient) < after + least:
                 return _validated(rig, without, held_out, transient)
     return found
 

@@ -332,7 +332,6 @@ class Effect:
         return self.kind.apply(rig, self.target, self.values)
 
     def parameters(self, rig: Rig) -> tuple[Parameter, ...]:
-        """Its parameters on a rig."""
         return self.kind.parameters(rig, self.target)
 
     @property

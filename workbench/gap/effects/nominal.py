@@ -99,7 +99,6 @@ OUTSIDE = ("delay", "gain", "place", "shape", "record")  # groups that do not ch
 
 @lru_cache(maxsize=4096)
 def group_of(parameter: str) -> str:
-    """The group that a parameter of the nominal errors belongs to."""
     return parameter.split("_", 1)[0]
 
 
@@ -161,7 +160,6 @@ def _parameters(rig: Rig, prior: NominalPrior | IdentifiedPrior) -> tuple[Parame
 
 
 def _each_parameter(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
-    """The parameters of the nominal errors, group by group."""
     along = isinstance(rig.structure, Structure)
 
     def with_prior(
@@ -291,8 +289,8 @@ def _with_couplings(modes: Modes, values: dict[str, float]) -> Modes:
         angles[r, s] = angle * values.get(name, 0.0)
     if not angles.any():
         return modes
-    shapes, turn = modes.shapes, expm(angles - angles.T * (modes.omega > 0))
-    return replace(modes, shapes=lambda located, derivative: shapes(located, derivative) @ turn)
+    shapes, rotation = modes.shapes, expm(angles - angles.T * (modes.omega > 0))
+    return replace(modes, shapes=lambda located, derivative: shapes(located, derivative) @ rotation)
 
 
 def _with_errors(rig: Rig, prior: NominalPrior | IdentifiedPrior, values: dict[str, float]) -> Rig:
@@ -371,8 +369,8 @@ def _place_bounds(rig: Rig, transducer: Transducer) -> Floats:
     """Lower and upper bounds (2, n_coordinates) of the error of a transducer's place, as shares of the extent."""
     domain = rig.modes.domain
     assert not isinstance(domain, NamedPoints)
-    room: Floats = (np.array(reach(domain, transducer.at)) - np.asarray(middle(transducer.at), float)) / domain.size
-    return room
+    ends = np.array(reach(domain, transducer.at))
+    return np.asarray((ends - np.asarray(middle(transducer.at), float)) / domain.size)
 
 
 @lru_cache(maxsize=64)

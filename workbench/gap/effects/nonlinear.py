@@ -45,7 +45,6 @@ NEGLIGIBLE_SPEED = 0.1  # factor on a smoothing speed that the records cannot di
 
 
 def with_element(rig: Rig, element: Element) -> Rig:
-    """The rig with one more element."""
     return replace(rig, elements=(*rig.elements, element))
 
 

@@ -371,7 +371,6 @@ def _movable(targets: Targets) -> Targets:
 
 
 def _nominal_place(rig: Rig, target: str) -> Location:
-    """Place of an actuator in the nominal rig."""
     return next(a.at for a in rig.actuators if a.name == target)
 
 

@@ -73,7 +73,6 @@ class CoupledReceptances:
         return real_product(weighted, tail), real_product(weighted, left)
 
     def on(self, kept: np.ndarray) -> "CoupledReceptances":
-        """The receptances at some of the lines."""
         return CoupledReceptances(self.compliance[kept], self.tail[kept])
 
 
@@ -98,6 +97,8 @@ class _SensorGroup:
 class UncoupledReceptances:
     """Receptances of modes that damping does not couple: products of mode shapes and modal receptances.
 
+    Its methods are those of `CoupledReceptances`.
+
     Attributes:
         compliance: (n_lines, n_modes) modal receptances.
         sensors: grouped by the derivative that they measure.
@@ -107,7 +108,6 @@ class UncoupledReceptances:
     sensors: tuple[_SensorGroup, ...]
 
     def to_force(self, shape: Floats) -> Complexes:
-        """See `CoupledReceptances`."""
         moved = self.compliance * shape
         readings = np.empty((len(moved), sum(group.here.size for group in self.sensors)), complex)
         for group in self.sensors:
@@ -115,14 +115,12 @@ class UncoupledReceptances:
         return readings
 
     def along(self, directions: Complexes) -> Complexes:
-        """See `CoupledReceptances`."""
         seen: list[Complexes] = [
             np.tile(directions[:, group.here] @ group.shapes, 2) * group.tail for group in self.sensors
         ]
         return sum(seen[1:], start=seen[0])
 
     def products(self, left: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See `CoupledReceptances`."""
         size = 2 * self.compliance.shape[1]
         own, along = np.zeros((size, size)), np.zeros(size)
         for group in self.sensors:
@@ -133,7 +131,6 @@ class UncoupledReceptances:
         return own, along
 
     def on(self, kept: np.ndarray) -> "UncoupledReceptances":
-        """See `CoupledReceptances`."""
         sensors = (replace(group, rates=group.rates[kept], tail=group.tail[kept]) for group in self.sensors)
         return UncoupledReceptances(self.compliance[kept], tuple(sensors))
 
@@ -148,9 +145,9 @@ def real_product(one: Complexes, other: Complexes) -> Floats:
 
 def receptances_of(rig: Rig, model: SampledModel, omega: Floats, n_samples: int, sample_time: float) -> Receptances:
     """The receptances of a rig, and of its sampled form, at spectral lines (n_lines,), rad/s, of a record."""
-    z = (1.0 + abs(UNDAMPED)) * np.exp(1j * omega * sample_time)
-    turn = _uncoupled if rig.modes.proportional else _coupled
-    return turn(rig, model, np.asarray(1j * omega, complex), z, np.sqrt(model.noise_variance), 1.0 / np.sqrt(n_samples))
+    z, rate = (1.0 + abs(UNDAMPED)) * np.exp(1j * omega * sample_time), np.asarray(1j * omega, complex)
+    of_modes = _uncoupled if rig.modes.proportional else _coupled
+    return of_modes(rig, model, rate, z, np.sqrt(model.noise_variance), 1.0 / np.sqrt(n_samples))
 
 
 def _coupled(
@@ -236,12 +233,10 @@ class Lines:
         return self._on(kept, weights[kept])
 
     def strongest(self, most: int) -> "Lines":
-        """At most `most` lines, those of the highest power."""
         strong = np.argsort(-self.weights * np.sum(np.abs(self.left) ** 2, axis=1))[:most]
         return self._on(strong, self.weights[strong])
 
     def _on(self, kept: np.ndarray, weights: np.ndarray) -> "Lines":
-        """Some of the lines, with their weights."""
         folded = tuple(each.on(kept) for each in self.folded)
         return Lines(self.receptances.on(kept), self.left[kept], weights, folded)
 

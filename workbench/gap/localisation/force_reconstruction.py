@@ -15,10 +15,10 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import (
     ForceFilter,
     SampledModel,
+    gauss_markov_force_filter,
     log_likelihood,
     sampled_model,
     smoothed_states,
-    wandering_force_filter,
 )
 from workbench.gap.prediction.workers import ALONE, Workers
 from workbench.rig.motion import Motion
@@ -114,7 +114,6 @@ class ForceReconstruction:
 
     @property
     def domain(self) -> Domain:
-        """Of places on the structure."""
         return self.rig.modes.domain
 
     @cached_property
@@ -127,7 +126,6 @@ class ForceReconstruction:
 
     @property
     def has_several_rates(self) -> bool:
-        """Whether the records differ in sample rate."""
         return len(set(self.sample_times)) > 1
 
     @cached_property
@@ -149,7 +147,7 @@ class ForceReconstruction:
         modes, (rms, memory) = self.rig.modes, size
         time, shape = memory * self.sample_times[0], modes.phi_at(where)
         each = self.models.items()
-        return {dt: wandering_force_filter(modes, model, shape, rms, time, dt) for dt, model in each}
+        return {dt: gauss_markov_force_filter(modes, model, shape, rms, time, dt) for dt, model in each}
 
     def _log_likelihood(self, where: Location, size: tuple[float, float], n_records: int | None = None) -> float:
         """Log-likelihood of an unknown force at a place, of a size as of `filters_at`, in the first or all records."""
@@ -231,7 +229,6 @@ class ForceReconstruction:
         return float(sum(each.misfit(shape) for each in (self.lines if lines is None else lines)))
 
     def misfits(self, places: Sequence[Any], lines: Sequence[Lines]) -> Floats:
-        """The misfit at each of the places."""
         return np.array(self.workers.map(lambda where: self.misfit(where, lines), places))
 
     def screened(self, places: Sequence[Any], lines: Sequence[Lines] | None = None) -> Floats:

@@ -21,7 +21,7 @@ from workbench.structure.modes import Modes
 
 LOOSE = 0.01  # of the inputs' rms: process noise forces that set the observer gain
 DOUBLINGS = 12  # squarings of the transition matrix in the test of stability: eight are enough for most
-RUN_AWAY = 1e100  # squared norm of a matrix power that can be squared once more without overflow
+DIVERGED = 1e100  # squared norm of a matrix power that can be squared once more without overflow
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +163,7 @@ def _is_growing(step: Floats) -> bool:
         size = float(np.einsum("ij,ij->", power, power))
         if size < 1.0:
             return False
-        if size > RUN_AWAY:
+        if size > DIVERGED:
             break
     return bool(np.abs(np.linalg.eigvals(step)).max() > 1.0)
 

@@ -70,7 +70,6 @@ class FitData:
 
     @property
     def n_values(self) -> int:
-        """Number of measured values."""
         return sum(record.outputs.size for record in self.counted)
 
     @property
@@ -119,9 +118,9 @@ class FitData:
         """
         if not sensitivity.size:
             return replace(self, nuisance=None)
-        _, sizes, turned = np.linalg.svd(_triangle(sensitivity))
+        _, sizes, vectors = np.linalg.svd(_triangle(sensitivity))
         root = np.sqrt(1.0 + sizes**2)
-        return replace(self, nuisance=sensitivity @ (turned[: root.size].T / np.sqrt(root * (root + 1.0))))
+        return replace(self, nuisance=sensitivity @ (vectors[: root.size].T / np.sqrt(root * (root + 1.0))))
 
     def one_step_ahead(self, rig: Rig, loose: float = LOOSE) -> "FitData":
         """The residual of one-step-ahead predictions, with a steady-state Kalman filter of this rig.

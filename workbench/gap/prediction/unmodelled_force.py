@@ -18,9 +18,9 @@ from workbench.rig.linear import integrated
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.modes import Modes
 
-RUNAWAY = 1e100
+DIVERGED = 1e100  # innovations, in any unit
 WHITE = np.zeros((1, 1))  # colour of a force that is uncorrelated from sample to sample
-TETHER = 1e-4  # radians a sample: frequency given to rigid modes
+LEAST_FREQUENCY = 1e-4  # radians a sample: frequency given to rigid modes
 DOUBLINGS = 40  # of the number of samples of a sum or of a steady state, at most
 
 
@@ -45,11 +45,13 @@ class SampledModel:
     noise_variance: np.ndarray
 
 
-def _tethered(modes: Modes, sample_time: float) -> Modes:
+def _without_zero_frequencies(modes: Modes, sample_time: float) -> Modes:
     """The modes with rigid ones on a very soft spring, as velocity sensors do not observe their displacement."""
     if modes.omega.all():
         return modes
-    return replace(modes, omega=np.where(modes.omega > 0, modes.omega, TETHER / sample_time), damping=modes.damping)
+    return replace(
+        modes, omega=np.where(modes.omega > 0, modes.omega, LEAST_FREQUENCY / sample_time), damping=modes.damping
+    )
 
 
 def sampled_model(modes: Modes, sensors: tuple[Sensor, ...], noise: np.ndarray, sample_time: float) -> SampledModel:
@@ -58,7 +60,7 @@ def sampled_model(modes: Modes, sensors: tuple[Sensor, ...], noise: np.ndarray, 
     For a sensor that is late by more than a sample, forces are taken as held over the delay.
     """
     n = modes.n_modes
-    own = _tethered(modes, sample_time).state_matrix
+    own = _without_zero_frequencies(modes, sample_time).state_matrix
     a = np.zeros((3 * n, 3 * n))
     a[: 2 * n, : 2 * n] = own
     a[n : 2 * n, 2 * n :] = np.eye(n)
@@ -144,17 +146,17 @@ def colour_of(memory: float, stages: int, *, flat: bool = False) -> Floats:
     return colour
 
 
-def wandering_force_filter(
+def gauss_markov_force_filter(
     modes: Modes, model: SampledModel, shape: np.ndarray, rms: float, correlation_time: float, sample_time: float
 ) -> ForceFilter:
-    """The filter for one force that is an Ornstein-Uhlenbeck process, discretised exactly.
+    """The filter for one force that is a first-order Gauss-Markov process, discretised exactly.
 
     Forces of contact and friction vary within a sample too. shape: (n_modes,) at the force; rms, N; times, s.
     """
     n = modes.n_modes
     size = 2 * n + 1
     a = np.zeros((size, size))
-    modes = _tethered(modes, sample_time)
+    modes = _without_zero_frequencies(modes, sample_time)
     a[: 2 * n, : 2 * n] = modes.state_matrix
     a[n : 2 * n, -1] = shape
     a[-1, -1] = -1.0 / correlation_time
@@ -237,7 +239,7 @@ def log_likelihood(filter_: ForceFilter, residuals: Sequence[Floats]) -> float:
     found = 0.0
     for residual in residuals:
         e = innovations(filter_, residual)
-        if not np.abs(e).max() < RUNAWAY:
+        if not np.abs(e).max() < DIVERGED:
             return -np.inf
         try:
             white = _of_unit_covariance(filter_, e)

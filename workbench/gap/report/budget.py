@@ -34,7 +34,7 @@ PERCENT = {
     "shape": ("shapes", 10.0),
 }
 MOSTLY = 0.5  # of the gap: its greater part; if that is unexplained, the fitted nominal errors have over-fitted it
-RUNAWAY = 1e30  # mean square of a divergent residual, in units of the signal's
+DIVERGED = 1e30  # mean square of a divergent residual, in units of the signal's
 COMMON = 2.0  # times the scatter of delays: a larger mean is reported as a common delay
 LEAST_DELAY = 1e-3  # of a sample: shorter delays are not reported
 DRAWS = 400  # bootstrap draws, for the interval of the shrinkage
@@ -182,7 +182,6 @@ class Budget:
 
     @property
     def is_mostly_unexplained(self) -> bool:
-        """Whether most of the gap is unexplained."""
         return self.unexplained > MOSTLY
 
     @property
@@ -278,17 +277,17 @@ def labels_of(effects: Sequence[Effect], domain: Domain) -> list[str]:
 
 
 def residual_powers(rig: Rig, effects: Sequence[Effect], records: Sequence[Record], transient: float) -> Floats:
-    """Mean square residual (n_records,) by a rig with effects, as `signal_power`; `RUNAWAY` for an impossible rig."""
+    """Mean square residual (n_records,) by a rig with effects, as `signal_power`; `DIVERGED` for an impossible rig."""
     try:
         corrected = apply_all(rig, effects)
     except (ValueError, np.linalg.LinAlgError):
-        return np.full(len(records), RUNAWAY)
+        return np.full(len(records), DIVERGED)
     # without one of two effects that balance each other, the response may diverge
     with np.errstate(over="ignore", invalid="ignore"):
         powers = [
             signal_power(record, record.outputs - simulate_record(corrected, record), transient) for record in records
         ]
-    return np.array([power if power < RUNAWAY else RUNAWAY for power in powers])
+    return np.array([power if power < DIVERGED else DIVERGED for power in powers])
 
 
 def signal_power(record: Record, readings: np.ndarray, transient: float) -> float:
@@ -366,7 +365,6 @@ class RecordToRecord:
 
     @property
     def label(self) -> str:
-        """Label in the budget."""
         return label_of(self.parameter)
 
     @property

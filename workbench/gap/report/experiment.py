@@ -157,7 +157,6 @@ class Experiment:
 
     @property
     def sentence(self) -> str:
-        """The proposal in a sentence."""
         one, other = map(in_words, self.alternatives)
         if not np.isfinite(self.seconds):
             return f"No experiment on this rig separates {one} from {other}."

@@ -52,7 +52,6 @@ class Spectra:
         return Spectra(lines, edges)
 
     def with_lines(self, lines: list[Complexes]) -> "Spectra":
-        """Spectra of other signals of the same records."""
         return Spectra(lines, self.edges)
 
     def select(self, at: Sequence[int]) -> "Spectra":
@@ -152,7 +151,6 @@ class Comparison:
 
     @cached_property
     def by_record(self) -> list["Comparison"]:
-        """The comparison of each record alone."""
         pairs = zip(self.records, self.simulated, strict=True)
         return [Comparison.of(self.rig, (record,), self.transient, (simulated,)) for record, simulated in pairs]
 
@@ -167,7 +165,6 @@ class Comparison:
 
     @property
     def record_names(self) -> tuple[str, ...]:
-        """Names of the records."""
         return tuple(record.name for record in self.records)
 
     @cached_property
@@ -183,12 +180,10 @@ class Comparison:
 
     @cached_property
     def measured_spectra(self) -> Spectra:
-        """Spectra of the measured outputs."""
         return self.spectra_of(self.measured)
 
     @cached_property
     def simulated_spectra(self) -> Spectra:
-        """Spectra of the simulated outputs."""
         return self.spectra_of(self.simulated)
 
     @cached_property

@@ -139,12 +139,10 @@ def records_alone(correction: Correction, rig: Rig, records: Sequence[Record]) -
 
 
 def without_record(name: str, rig: Rig, records: Sequence[Record]) -> Corrected:
-    """One record left out."""
     return rig, tuple(record for record in records if record.name != name)
 
 
 def without_output(name: str, rig: Rig, records: Sequence[Record]) -> Corrected:
-    """One output left out of rig and records."""
     sensors = tuple(sensor for sensor in rig.sensors if sensor.name != name)
     return replace(rig, sensors=sensors), tuple(r.select_outputs([s.name for s in sensors]) for r in records)
 
@@ -157,7 +155,6 @@ def outputs_times(factors: dict[str, float], rig: Rig, records: Sequence[Record]
 
 
 def inputs_times(factors: dict[str, float], rig: Rig, records: Sequence[Record]) -> Corrected:
-    """Inputs of the records multiplied by factors."""
     by = np.array([factors.get(actuator.name, 1.0) for actuator in rig.actuators])
     return rig, tuple(replace(record, inputs=by[:, None] * record.inputs) for record in records)
 
@@ -170,17 +167,14 @@ def exchanged(side: str, one: str, other: str, rig: Rig, records: Sequence[Recor
 
 
 def relabelled(rig: Rig, names: Collection[str], quantity: str) -> Rig:
-    """The rig with another quantity stated for some of its sensors."""
     return replace(rig, sensors=tuple(replace(s, quantity=quantity) if s.name in names else s for s in rig.sensors))
 
 
 def quantity_set(names: frozenset[str], quantity: str, rig: Rig, records: Sequence[Record]) -> Corrected:
-    """Another quantity stated for some sensors, and the records unchanged."""
     return relabelled(rig, names, quantity), tuple(records)
 
 
 def rate_times(factor: float, rig: Rig, records: Sequence[Record]) -> Corrected:
-    """The sampling rates of the records multiplied by a factor."""
     return rig, tuple(replace(r, sample_time=r.sample_time / factor) for r in records)
 
 

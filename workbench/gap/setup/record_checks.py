@@ -97,7 +97,6 @@ def check_alive(
 
 
 def _is_driven(record: Record) -> bool:
-    """Whether any input of a record is not zero."""
     return bool(np.any(record.inputs))
 
 

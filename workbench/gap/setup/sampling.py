@@ -38,7 +38,6 @@ CLEAR = 4.0  # times the noise power: a smaller residual of an output shows no d
 
 
 def sampling_rates(gap: Comparison) -> list[SetupFault]:
-    """Faults of the stated sampling rates of records."""
     rig, records = gap.rig, gap.records
     wrong: dict[float, list[int]] = {}
     for i, (record, own) in enumerate(zip(records, gap.by_record, strict=True)):
