@@ -372,6 +372,10 @@ class Effect:
         """The same effect at another place."""
         return replace(self, values={**self.values, **place_values(where)})
 
+    def of_kind(self, kind: Kind, **values: float) -> "Effect":
+        """An effect of another kind, without a target, at the same place."""
+        return Effect(kind, None, {**place_values(self.at), **values})
+
     @property
     def words(self) -> str:
         """Its name in a sentence."""

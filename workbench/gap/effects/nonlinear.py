@@ -160,10 +160,6 @@ def _contact_starts(place: ForceAndMotion, reach: Floats) -> Iterator[dict[str, 
         yield from ({"stiffness": share * k, "gap": float(gap)} for share in (1.0, 4.0) if k > 0)
 
 
-def _without_gap(effect: Effect, _: Rig) -> tuple[Effect, ...]:
-    return (Effect(GROUND_SPRING, None, {**place_values(effect.at), "stiffness": effect.values["stiffness"]}),)
-
-
 CLEARANCE = Kind(
     name="clearance",
     path="structure",
@@ -171,7 +167,7 @@ CLEARANCE = Kind(
     apply=lambda rig, _, v: with_element(rig, Clearance(place_of(v), v["stiffness"], v["gap"])),
     starts=_at_peaks(lambda place: _contact_starts(place, np.abs(place.displacement))),
     nonlinear=True,
-    simpler=_without_gap,
+    simpler=lambda contact, _: (contact.of_kind(GROUND_SPRING, stiffness=contact.values["stiffness"]),),
     force_laws={"displacement": lambda v, w: -v["stiffness"] * np.sign(w) * np.maximum(np.abs(w) - v["gap"], 0.0)},
     phrase="a two-sided clearance",
 )
@@ -200,7 +196,7 @@ def _friction_starts(place: ForceAndMotion) -> Iterator[dict[str, float]]:
 def _as_damper(friction: Effect, _: Rig) -> tuple[Effect, ...]:
     """The viscous damper that friction is far below its smoothing speed."""
     coefficient = friction.values["force"] / friction.values["smoothing_speed"]
-    return (Effect(POINT_DAMPER, None, {**place_values(friction.at), "coefficient": coefficient}),)
+    return (friction.of_kind(POINT_DAMPER, coefficient=coefficient),)
 
 
 def _has_negligible_speed(friction: Effect) -> bool:
@@ -230,8 +226,8 @@ def _with_negligible_speed(friction: Effect) -> Effect:
 
 
 def _direction_dependent(friction: Effect, offset: float = 0.0) -> Effect:
-    numbers = _two_way_values(friction.values["force"], offset, friction.values["smoothing_speed"])
-    return Effect(TWO_WAY_FRICTION, None, {**place_values(friction.at), **numbers})
+    values = _two_way_values(friction.values["force"], offset, friction.values["smoothing_speed"])
+    return friction.of_kind(TWO_WAY_FRICTION, **values)
 
 
 def _merged_with_bias(friction: Effect, other: Effect) -> Effect | None:
@@ -276,12 +272,15 @@ def _bouc_wen_starts(reconstruction: Reconstruction, _: object) -> Iterator[dict
                 yield {**place_values(place.at), "stiffness": part * k, "yield_displacement": share * size}
 
 
-def _as_friction(spring: Effect, rig: Rig) -> tuple[Effect, ...]:
-    """The friction that a hysteretic spring is if it always slides: z reverses over about twice its largest value."""
-    v = spring.values
-    speed = v["yield_displacement"] / Scales.of(rig).time
-    numbers = {"force": v["stiffness"] * v["yield_displacement"], "smoothing_speed": speed}
-    return (Effect(COULOMB_FRICTION, None, {**place_values(spring.at), **numbers}),)
+def _as_spring_or_friction(spring: Effect, rig: Rig) -> tuple[Effect, ...]:
+    """The spring that a hysteretic spring is if it never yields, and the friction if it always slides.
+
+    Its internal variable z reverses over about twice its largest value.
+    """
+    stiffness, limit = spring.values["stiffness"], spring.values["yield_displacement"]
+    speed = limit / Scales.of(rig).time
+    friction = spring.of_kind(COULOMB_FRICTION, force=stiffness * limit, smoothing_speed=speed)
+    return (spring.of_kind(GROUND_SPRING, stiffness=stiffness), friction)
 
 
 BOUC_WEN = Kind(
@@ -295,7 +294,7 @@ BOUC_WEN = Kind(
     apply=lambda rig, _, v: with_element(rig, BoucWen(place_of(v), v["stiffness"], v["yield_displacement"])),
     starts=_bouc_wen_starts,
     nonlinear=True,
-    simpler=lambda spring, rig: (*_without_gap(spring, rig), *_as_friction(spring, rig)),
+    simpler=_as_spring_or_friction,
     phrase="a hysteretic spring",
 )
 
@@ -317,11 +316,6 @@ def _with_slip(rig: Rig, _: object, v: dict[str, Any]) -> Rig:
     )
 
 
-def _as_stiffness_loss(joint: Effect, _: Rig) -> tuple[Effect, ...]:
-    """The loss of stiffness that a joint is if it always slips."""
-    return (Effect(GROUND_SPRING, None, {**place_values(joint.at), "stiffness": -joint.values["stiffness"]}),)
-
-
 JOINT_SLIP = Kind(
     name="joint_slip",
     path="structure",
@@ -330,7 +324,7 @@ JOINT_SLIP = Kind(
     starts=_at_peaks(_slip_starts),
     targets=lambda rig: (None,) if isinstance(rig.modes.domain, NamedPoints) and any(rig.modes.domain.pairs()) else (),
     nonlinear=True,
-    simpler=_as_stiffness_loss,
+    simpler=lambda joint, _: (joint.of_kind(GROUND_SPRING, stiffness=-joint.values["stiffness"]),),  # always slipping
     phrase="a joint that slips",
 )
 
@@ -350,25 +344,20 @@ def _two_way_values(force: float, offset: float, speed: float) -> dict[str, floa
     return {"force_forward": force + offset, "force_backward": force - offset, "smoothing_speed": speed}
 
 
-def _force_and_offset(v: Mapping[str, Any]) -> tuple[float, float]:
-    """Mean friction force of both directions, and half their difference, N."""
-    return 0.5 * (v["force_forward"] + v["force_backward"]), 0.5 * (v["force_forward"] - v["force_backward"])
-
-
-def _as_coulomb_friction(friction: Effect, _: Rig) -> tuple[Effect, ...]:
-    force, _offset = _force_and_offset(friction.values)
-    numbers = {"force": force, "smoothing_speed": friction.values["smoothing_speed"]}
-    return (Effect(COULOMB_FRICTION, None, {**place_values(friction.at), **numbers}),)
-
-
 def _two_way_element(v: Mapping[str, Any]) -> CoulombFriction:
-    force, offset = _force_and_offset(v)
+    """Friction of the mean force of both directions, N, with half their difference as an offset."""
+    force, offset = (0.5 * (v["force_forward"] + sign * v["force_backward"]) for sign in (1.0, -1.0))
     return CoulombFriction(place_of(v), force, v["smoothing_speed"], offset)
 
 
 def _two_way_law(v: Mapping[str, Any], u: Floats) -> Floats:
-    force, offset = _force_and_offset(v)
-    return -force * np.tanh(u / float(v["smoothing_speed"])) - offset
+    friction = _two_way_element(v)
+    return -friction.force * np.tanh(u / float(friction.smoothing_speed)) - friction.offset
+
+
+def _as_coulomb_friction(friction: Effect, _: Rig) -> tuple[Effect, ...]:
+    mean = _two_way_element(friction.values)
+    return (friction.of_kind(COULOMB_FRICTION, force=mean.force, smoothing_speed=mean.smoothing_speed),)
 
 
 TWO_WAY_FRICTION = Kind(
@@ -431,19 +420,17 @@ EXPONENTS = (1.5, 2.0, 4.0, 6.0)  # start values
 SAME_POWER = 0.05  # an exponent as close as this to that of a kind of the catalogue is the same within small errors
 
 
-def _power_force(v: Mapping[str, Any], motion: Floats) -> Floats:
-    """-F |w / w_r|^p."""
-    force, rms, exponent = float(v["force_at_rms"]), float(v["rms"]), float(v["exponent"])
-    return -force * np.abs(motion / rms) ** exponent
-
-
 def _power_law(element: type, name: str, motion: str, words: str, *, even: bool = False) -> Kind:
+    def power(u: Floats, rms: float, exponent: float) -> Floats:
+        """±|u / rms|^p."""
+        return np.asarray((1.0 if even else np.sign(u)) * np.abs(u / rms) ** exponent)
+
     def starts(place: ForceAndMotion) -> Iterator[dict[str, float]]:
         path = getattr(place, motion)
         rms = _rms(path)
         for exponent in EXPONENTS if rms > 0 else ():
-            basis = (1.0 if even else np.sign(path)) * np.abs(path / rms) ** exponent
-            yield {"force_at_rms": place.strength_along(basis), "exponent": exponent, "rms": rms}
+            force = place.strength_along(power(path, rms, exponent))
+            yield {"force_at_rms": force, "exponent": exponent, "rms": rms}
 
     return Kind(
         name=name,
@@ -457,7 +444,7 @@ def _power_law(element: type, name: str, motion: str, words: str, *, even: bool 
         starts=_at_peaks(starts),
         nonlinear=True,
         phrase=words,
-        force_laws={motion: lambda v, u: (1.0 if even else np.sign(u)) * _power_force(v, u)},
+        force_laws={motion: lambda v, u: -v["force_at_rms"] * power(u, v["rms"], v["exponent"])},
     )
 
 
@@ -481,7 +468,7 @@ def in_catalogue(law: Effect) -> Effect | None:
     if (law.kind, power) not in POWERS or abs(v["exponent"] - power) > SAME_POWER:
         return None
     kind, number = POWERS[law.kind, power]
-    return Effect(kind, None, {**place_values(law.at), number: v["force_at_rms"] / v["rms"] ** power})
+    return law.of_kind(kind, **{number: v["force_at_rms"] / v["rms"] ** power})
 
 
 def any_beyond(effects: Iterable[Effect]) -> bool:
