@@ -31,8 +31,8 @@ from workbench.structure.profile import Profile
 STIFFNESS, TENSION = "stiffness", "axial load"  # the first includes the effect of temperature on a modulus
 EQUAL_WAVES = 9  # cosines up to which all have the same prior; with more, it falls with the square of the wave number
 HALF_WAVES = 3  # beyond so many half waves, as the series of any function with a slope at its ends does
-PROFILE_UNIT, RATIO_UNIT, DELAY_UNIT = 0.01, 0.1, 0.1  # of free coordinates: relative, of a logarithm, of a sample
-PLACE_UNIT = 0.001  # likewise, of the extent
+# units of free coordinates: of a logarithm, of a sample, of the extent; and of other groups, relative
+UNITS, RELATIVE_UNIT = {"damping": 0.1, "delay": 0.1, "place": 0.001}, 0.01
 LARGEST_DELAY = 0.9  # of a sample: bound of a sensor's delay or lead
 JUST_LATE = 1e-3  # of a sample: an accelerometer that is later reads the value before a jump
 NEGLIGIBLE = 1e-9  # of the largest variance of identified errors, normalised: directions below it are left out
@@ -162,49 +162,43 @@ def _parameters(rig: Rig, prior: NominalPrior | IdentifiedPrior) -> tuple[Parame
 def _each_parameter(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
     along = isinstance(rig.structure, Structure)
 
-    def with_prior(
-        name: str, std: float, unit: float, low: float = -np.inf, high: float = np.inf, sensor: str = ""
-    ) -> Parameter:
+    def with_prior(name: str, low: float = -np.inf, high: float = np.inf, sensor: str = "") -> Parameter:
+        group, weight = group_of(name), weight_of(name, prior)
+        std, unit = getattr(prior, group), UNITS.get(group, RELATIVE_UNIT)
         # bounds do not shrink with an estimated prior, so that errors of a profile keep their values
-        least = PROFILE_STD if along and group_of(name) in ("stiffness", "mass") else unit
-        reach, unit = BOUND * max(std, least), unit * weight_of(name, prior)
-        prior_std = max(std * weight_of(name, prior) / unit, 1e-6)
+        least = PROFILE_STD if along and group in ("stiffness", "mass") else unit
+        reach, unit = BOUND * max(std, least), unit * weight
+        prior_std = max(std * weight / unit, 1e-6)
         return Parameter(name, "", max(low, -reach), min(high, reach), scale=unit, prior_std=prior_std, sensor=sensor)
 
-    waves = prior.waves if along else 1
-    if prior.stiffness and along:
-        yield from (with_prior(f"stiffness_{k}", prior.stiffness, PROFILE_UNIT) for k in range(waves))
-    if prior.mass:
-        yield from (with_prior(f"mass_{k}", prior.mass, PROFILE_UNIT) for k in range(waves))
-    modes = range(1, rig.modes.n_modes + 1)
-    if prior.frequency:
-        elastic = (r for r in modes if rig.modes.omega[r - 1] > 0)
-        yield from (with_prior(f"frequency_{r}", prior.frequency, PROFILE_UNIT) for r in elastic)
-    if prior.coupling:
-        couplings = _couplings(rig.modes.omega.tobytes())
-        yield from (with_prior(name, prior.coupling, PROFILE_UNIT) for name, *_ in couplings)
-    if prior.damping:
-        yield from (with_prior(f"damping_{r}", prior.damping, RATIO_UNIT) for r in modes)
+    waves, modes = prior.waves if along else 1, range(1, rig.modes.n_modes + 1)
+    names = {
+        "stiffness": [f"stiffness_{k}" for k in range(waves if along else 0)],
+        "mass": [f"mass_{k}" for k in range(waves)],
+        "frequency": [f"frequency_{r}" for r in modes if rig.modes.omega[r - 1] > 0],
+        "coupling": [name for name, *_ in _couplings(rig.modes.omega.tobytes())],
+        "damping": [f"damping_{r}" for r in modes],
+    }
+    yield from (with_prior(name) for group in names if getattr(prior, group) for name in names[group])
     if prior.delay:
         for sensor in rig.sensors:
             low = JUST_LATE if sensor.name in prior.late else -LARGEST_DELAY
             high = 0.0 if sensor.name in prior.early else LARGEST_DELAY
-            yield with_prior(f"delay_{sensor.name}", prior.delay, DELAY_UNIT, low, high, sensor.name)
+            yield with_prior(f"delay_{sensor.name}", low, high, sensor.name)
     # a transducer, and the sensor that alone reads its errors
     transducers: list[tuple[Transducer, str]] = [(actuator, "") for actuator in rig.actuators]
     transducers += [(sensor, sensor.name) for sensor in rig.sensors]
     if prior.gain:
-        yield from (with_prior(_gain_name(each), prior.gain, PROFILE_UNIT, sensor=own) for each, own in transducers)
+        yield from (with_prior(_gain_name(transducer), sensor=own) for transducer, own in transducers)
     if prior.place:
         for transducer, own in transducers:
             for name, low, high in zip(_place_names(rig, transducer), *_place_bounds(rig, transducer), strict=True):
-                yield with_prior(name, prior.place, PLACE_UNIT, float(low), float(high), own)
+                yield with_prior(name, float(low), float(high), own)
     if prior.shape:
         for at, own in (*transducers, *((point, "") for point in prior.points)):
-            for name in _shape_names(at, rig.modes.n_modes):
-                yield with_prior(name, prior.shape, PROFILE_UNIT, sensor=own)
+            yield from (with_prior(name, sensor=own) for name in _shape_names(at, rig.modes.n_modes))
     if prior.record:
-        yield from (with_prior(f"record_{name}", prior.record, PROFILE_UNIT) for name in prior.records)
+        yield from (with_prior(f"record_{name}") for name in prior.records)
 
 
 def _with_variation(profile: Profile, amplitudes: np.ndarray, length: float) -> Profile:

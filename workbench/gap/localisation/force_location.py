@@ -10,7 +10,7 @@ from scipy.optimize import minimize, minimize_scalar
 
 from workbench.arrays import Floats
 from workbench.gap.localisation.force_lines import Lines
-from workbench.gap.localisation.force_reconstruction import ForceReconstruction, minima
+from workbench.gap.localisation.force_reconstruction import RECONSTRUCTION, ForceReconstruction, minima
 from workbench.renamed import Renamed
 from workbench.structure.domain import Between, Interval, NamedPoints, Rectangle
 from workbench.threads import one_blas_thread
@@ -22,7 +22,6 @@ class LocalisationSettings:
 
     valleys: int = 3  # local minima of the misfit that are refined
     rounds: int = 3  # alternations between the place and the weights of the lines
-    beside: float = 0.95  # of the grid spacing: range about a minimum in which it is refined
     resolved: float = 1e-3  # of the grid spacing: tolerance of the refinement
     pairs_shown: int = 12  # of named points
     two_sigma: float = 4.0  # rise of the misfit at two standard errors
@@ -148,7 +147,7 @@ def _refined(reconstruction: ForceReconstruction, top: float) -> float:
     """The local minimum of the misfit along an interval."""
     at, informative = float(top), reconstruction.informative(top)
     length, spacing = reconstruction.domain.size, reconstruction.places[1] - reconstruction.places[0]
-    edge, beside = LOCALISATION.edge * length, LOCALISATION.beside * spacing
+    edge, beside = LOCALISATION.edge * length, RECONSTRUCTION.beside * spacing
     for _ in range(LOCALISATION.rounds):
         found = minimize_scalar(
             reconstruction.misfit,

@@ -35,7 +35,7 @@ class ReconstructionSettings:
     most_peaks: int = 3  # of the likelihood that are kept
     one_rate: float = 1e-6  # relative difference of the sample times of two records that are taken for one
     places: int = 40  # of the grid along an interval
-    beside: float = 0.95  # of the grid spacing: range about a peak in which it is refined
+    beside: float = 0.95  # of the grid spacing: range about a peak, or a minimum, in which it is refined
     resolved: float = 2e-3  # of the grid spacing: tolerance of the refinement
     still: float = 1e-6  # of the largest mode shape: a point, or a pair of points, that no force moves
     broad: float = 0.1  # of a rectangle's diagonal: least distance between peaks
@@ -234,8 +234,8 @@ class ForceReconstruction:
     def screened(self, places: Sequence[Any], lines: Sequence[Lines] | None = None) -> Floats:
         """The approximate misfit at each of many places, without transients."""
         shapes = np.array([self.rig.modes.phi_at(where) for where in places])
-        misfits: Floats = np.sum([screened(each, shapes) for each in (self.lines if lines is None else lines)], axis=0)
-        return misfits
+        chosen = self.lines if lines is None else lines
+        return np.asarray(np.sum([screened(each, shapes) for each in chosen], axis=0))
 
     @cached_property
     def _likeliest_places(self) -> tuple[Any, ...]:
