@@ -125,6 +125,9 @@ class Parameter:
         return float(np.hypot(value, self.scale)) if self.low < 0 else value
 
 
+Parameters = Callable[[Rig, Any], tuple[Parameter, ...]]
+
+
 def positive(
     name: str, unit: str, size: float, low: float = 1e-12, high: float = 1e12, neutral: float | None = None
 ) -> Parameter:
@@ -140,6 +143,11 @@ def place_parameters(rig: Rig) -> tuple[Parameter, ...]:
     lengths = domain.length if isinstance(domain, Rectangle) else (domain.size,)
     named = zip(domain.coordinates, lengths, strict=True)
     return tuple(Parameter(name, "m", 0.0, length, scale=0.01 * length) for name, length in named)
+
+
+def at_a_place(*of_scales: Callable[[Scales], Parameter]) -> Parameters:
+    """The coordinates of a place, and further parameters from the scales of a rig."""
+    return lambda rig, _: (*place_parameters(rig), *(parameter(Scales.of(rig)) for parameter in of_scales))
 
 
 def place_of(values: Mapping[str, Any]) -> Any:
@@ -271,7 +279,7 @@ class Kind:
 
     name: str
     path: str
-    parameters: Callable[[Rig, Any], tuple[Parameter, ...]]
+    parameters: Parameters
     apply: Callable[[Rig, Any, dict[str, Any]], Rig]
     starts: Starts
     targets: Callable[[Rig], tuple[Any, ...]] = lambda rig: (None,)

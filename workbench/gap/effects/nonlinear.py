@@ -15,8 +15,8 @@ from workbench.gap.effects.effect import (
     Reconstruction,
     Scales,
     Starts,
+    at_a_place,
     place_of,
-    place_parameters,
     place_values,
     positive,
 )
@@ -67,15 +67,15 @@ def _cubic_starts(place: ForceAndMotion) -> list[dict[str, float]]:
     return [{"stiffness": share * k} for share in (0.3, 1.0, -1.0, 3.0)]
 
 
-def _cubic_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
-    unit = Scales.of(rig).stiffness / Scales.of(rig).length ** 2
-    return (*place_parameters(rig), Parameter("stiffness", "N/m^3", -1e15 * unit, 1e15 * unit, scale=unit, neutral=0.0))
+def _cubic_stiffness(scales: Scales) -> Parameter:
+    unit = scales.stiffness / scales.length**2
+    return Parameter("stiffness", "N/m^3", -1e15 * unit, 1e15 * unit, scale=unit, neutral=0.0)
 
 
 CUBIC_SPRING = Kind(
     name="cubic_spring",
     path="structure",
-    parameters=_cubic_parameters,
+    parameters=at_a_place(_cubic_stiffness),
     apply=lambda rig, _, v: with_element(rig, CubicSpring(place_of(v), v["stiffness"])),
     starts=_at_peaks(_cubic_starts),
     nonlinear=True,
@@ -145,10 +145,12 @@ AIR_DRAG = Kind(
 # --- clearance and one_sided_stop
 
 
-def _contact_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
-    scales = Scales.of(rig)
-    stiffness = positive("stiffness", "N/m", scales.stiffness, neutral=0.0)
-    return (*place_parameters(rig), stiffness, positive("gap", "m", scales.length))
+def _stiffness(scales: Scales) -> Parameter:
+    return positive("stiffness", "N/m", scales.stiffness, neutral=0.0)
+
+
+def _smoothing_speed(scales: Scales) -> Parameter:
+    return positive("smoothing_speed", "m/s", scales.speed)
 
 
 def _contact_starts(place: ForceAndMotion, reach: Floats) -> Iterator[dict[str, float]]:
@@ -163,7 +165,7 @@ def _contact_starts(place: ForceAndMotion, reach: Floats) -> Iterator[dict[str, 
 CLEARANCE = Kind(
     name="clearance",
     path="structure",
-    parameters=_contact_parameters,
+    parameters=at_a_place(_stiffness, lambda scales: positive("gap", "m", scales.length)),
     apply=lambda rig, _, v: with_element(rig, Clearance(place_of(v), v["stiffness"], v["gap"])),
     starts=_at_peaks(lambda place: _contact_starts(place, np.abs(place.displacement))),
     nonlinear=True,
@@ -175,7 +177,7 @@ CLEARANCE = Kind(
 ONE_SIDED_STOP = Kind(
     name="one_sided_stop",
     path="structure",
-    parameters=_contact_parameters,
+    parameters=at_a_place(_stiffness, lambda scales: positive("gap", "m", scales.length)),
     apply=lambda rig, _, v: with_element(rig, OneSidedStop(place_of(v), v["stiffness"], v["gap"])),
     starts=_at_peaks(lambda place: _contact_starts(place, place.displacement)),
     nonlinear=True,
@@ -240,11 +242,7 @@ def _merged_with_bias(friction: Effect, other: Effect) -> Effect | None:
 COULOMB_FRICTION = Kind(
     name="coulomb_friction",
     path="structure",
-    parameters=lambda rig, _: (
-        *place_parameters(rig),
-        positive("force", "N", Scales.of(rig).force, neutral=0.0),
-        positive("smoothing_speed", "m/s", Scales.of(rig).speed),
-    ),
+    parameters=at_a_place(lambda scales: positive("force", "N", scales.force, neutral=0.0), _smoothing_speed),
     apply=lambda rig, _, v: with_element(rig, CoulombFriction(place_of(v), v["force"], v["smoothing_speed"])),
     starts=_at_peaks(_friction_starts),
     nonlinear=True,
@@ -286,11 +284,7 @@ def _as_spring_or_friction(spring: Effect, rig: Rig) -> tuple[Effect, ...]:
 BOUC_WEN = Kind(
     name="bouc_wen",
     path="structure",
-    parameters=lambda rig, _: (
-        *place_parameters(rig),
-        positive("stiffness", "N/m", Scales.of(rig).stiffness, neutral=0.0),
-        positive("yield_displacement", "m", Scales.of(rig).length),
-    ),
+    parameters=at_a_place(_stiffness, lambda scales: positive("yield_displacement", "m", scales.length)),
     apply=lambda rig, _, v: with_element(rig, BoucWen(place_of(v), v["stiffness"], v["yield_displacement"])),
     starts=_bouc_wen_starts,
     nonlinear=True,
@@ -363,11 +357,10 @@ def _as_coulomb_friction(friction: Effect, _: Rig) -> tuple[Effect, ...]:
 TWO_WAY_FRICTION = Kind(
     name="two_way_friction",
     path="structure",
-    parameters=lambda rig, _: (
-        *place_parameters(rig),
-        positive("force_forward", "N", Scales.of(rig).force, neutral=0.0),
-        positive("force_backward", "N", Scales.of(rig).force, neutral=0.0),
-        positive("smoothing_speed", "m/s", Scales.of(rig).speed),
+    parameters=at_a_place(
+        lambda scales: positive("force_forward", "N", scales.force, neutral=0.0),
+        lambda scales: positive("force_backward", "N", scales.force, neutral=0.0),
+        _smoothing_speed,
     ),
     apply=lambda rig, _, v: with_element(rig, _two_way_element(v)),
     starts=_at_peaks(_two_way_starts),
@@ -391,9 +384,8 @@ def _quadratic_starts(place: ForceAndMotion) -> list[dict[str, float]]:
 QUADRATIC_DAMPER = Kind(
     name="quadratic_damper",
     path="structure",
-    parameters=lambda rig, _: (
-        *place_parameters(rig),
-        positive("coefficient", "N s^2/m^2", Scales.of(rig).damping / Scales.of(rig).speed, neutral=0.0),
+    parameters=at_a_place(
+        lambda scales: positive("coefficient", "N s^2/m^2", scales.damping / scales.speed, neutral=0.0)
     ),
     apply=lambda rig, _, v: with_element(rig, PowerDamper(place_of(v), v["coefficient"], 1.0, 2.0)),
     starts=_at_peaks(_quadratic_starts),
@@ -435,10 +427,9 @@ def _power_law(element: type, name: str, motion: str, words: str, *, even: bool 
     return Kind(
         name=name,
         path="structure",
-        parameters=lambda rig, _: (
-            *place_parameters(rig),
-            Parameter("force_at_rms", "N", -1e15 * Scales.of(rig).force, 1e15 * Scales.of(rig).force),
-            Parameter("exponent", "", 1.0, 9.0),
+        parameters=at_a_place(
+            lambda scales: Parameter("force_at_rms", "N", -1e15 * scales.force, 1e15 * scales.force),
+            lambda _: Parameter("exponent", "", 1.0, 9.0),
         ),
         apply=lambda rig, _, v: with_element(rig, element(place_of(v), v["force_at_rms"], v["rms"], v["exponent"])),
         starts=_at_peaks(starts),

@@ -13,6 +13,7 @@ from workbench.gap.effects.effect import (
     Parameter,
     Reconstruction,
     Scales,
+    at_a_place,
     place_of,
     place_parameters,
     place_values,
@@ -208,21 +209,16 @@ def _point_starts(
 POINT_MASS = Kind(
     name="point_mass",
     path="structure",
-    parameters=lambda rig, _: (
-        *place_parameters(rig),
-        positive("mass", "kg", Scales.of(rig).mass, 1e-8, 1e5, neutral=0.0),
-    ),
+    parameters=at_a_place(lambda scales: positive("mass", "kg", scales.mass, 1e-8, 1e5, neutral=0.0)),
     apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointMass(place_of(v), v["mass"]))),
     starts=_point_starts("mass", "acceleration", "mass", between=False),
     phrase="an added mass",
 )
 
 
-def _spring_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
-    size = Scales.of(rig).stiffness
-    bounds = -1e5 * size, 1e5 * size
-    stiffness = Parameter("stiffness", "N/m", *bounds, logarithmic=True, scale=1e-8 * size, neutral=0.0)
-    return (*place_parameters(rig), stiffness)
+def _spring_stiffness(scales: Scales) -> Parameter:
+    bounds = -1e5 * scales.stiffness, 1e5 * scales.stiffness
+    return Parameter("stiffness", "N/m", *bounds, logarithmic=True, scale=1e-8 * scales.stiffness, neutral=0.0)
 
 
 def _as_rotational_spring(spring: Effect, rig: Rig) -> tuple[Effect, ...]:
@@ -239,7 +235,7 @@ def _as_rotational_spring(spring: Effect, rig: Rig) -> tuple[Effect, ...]:
 GROUND_SPRING = Kind(
     name="ground_spring",
     path="structure",
-    parameters=_spring_parameters,
+    parameters=at_a_place(_spring_stiffness),
     apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointSpring(place_of(v), v["stiffness"]))),
     starts=_point_starts("stiffness", "displacement", "stiffness", signed=True),
     phrase="a spring to ground",
@@ -251,10 +247,7 @@ GROUND_SPRING = Kind(
 POINT_DAMPER = Kind(
     name="point_damper",
     path="structure",
-    parameters=lambda rig, _: (
-        *place_parameters(rig),
-        positive("coefficient", "N s/m", Scales.of(rig).damping, 1e-8, 1e5, neutral=0.0),
-    ),
+    parameters=at_a_place(lambda scales: positive("coefficient", "N s/m", scales.damping, 1e-8, 1e5, neutral=0.0)),
     apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointDamper(place_of(v), v["coefficient"]))),
     starts=_point_starts("coefficient", "velocity", "damping"),
     phrase="a viscous damper to ground",

@@ -13,6 +13,7 @@ from workbench.gap.effects.effect import (
     Effect,
     Kind,
     Parameter,
+    Parameters,
     Reconstruction,
     Scales,
     Starts,
@@ -37,7 +38,6 @@ SLOW_ENTRY = 0.1  # of the rms step between samples: a reading that reaches its 
 LONG_STAY = 6.0
 TURNING_SAMPLES = 2  # longest stay of a motion that reverses slowly
 
-Parameters = Callable[[Rig, Any], tuple[Parameter, ...]]
 Apply = Callable[[Rig, Any, dict[str, Any]], Rig]
 Targets = Callable[[Rig], tuple[str, ...]]
 
