@@ -1,6 +1,6 @@
 """Kinds of effects of actuators and sensors."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import combinations, permutations
 from typing import Any
@@ -63,10 +63,8 @@ def or_all(each: Targets) -> Targets:
 
 
 def _change_actuators(rig: Rig, target: str, **changes: Any) -> Rig:
-    changed = tuple(
-        replace(a, **changes) if (a.name == target or (target == ALL and not a.direct)) else a for a in rig.actuators
-    )
-    return replace(rig, actuators=changed)
+    names = each_actuator(rig) if target == ALL else (target,)
+    return replace(rig, actuators=tuple(replace(a, **changes) if a.name in names else a for a in rig.actuators))
 
 
 def _change_sensors(rig: Rig, target: str, **changes: Any) -> Rig:
@@ -240,9 +238,7 @@ ACTUATOR_BIAS = Kind(
     path="actuator",
     parameters=_bias_parameters,
     apply=_set("actuators", "force", "bias"),
-    starts=lambda reconstruction, target: [
-        {"force": 0.1 * float(np.sqrt(np.mean(_commands(reconstruction, target) ** 2)))}
-    ],
+    starts=lambda force, target: [{"force": 0.1 * float(np.sqrt(np.mean(_commands(force, target) ** 2)))}],
     targets=each_actuator,
     signed=True,
     phrase="a constant force of an actuator",
@@ -261,10 +257,9 @@ ACTUATOR_RATE_LIMIT = Kind(
 )
 
 
-def _hysteresis_starts(reconstruction: Reconstruction, target: str) -> Iterator[dict[str, float]]:
-    for width in np.quantile(_commands(reconstruction, target), (0.2, 0.5, 0.8)):
-        for share in (0.1, 0.4):
-            yield {"share": share, "width": float(width)}
+def _hysteresis_starts(reconstruction: Reconstruction, target: str) -> list[dict[str, float]]:
+    widths = np.quantile(_commands(reconstruction, target), (0.2, 0.5, 0.8))
+    return [{"share": share, "width": float(width)} for width in widths for share in (0.1, 0.4)]
 
 
 ACTUATOR_HYSTERESIS = Kind(
@@ -274,9 +269,7 @@ ACTUATOR_HYSTERESIS = Kind(
         Parameter("share", "", 1e-4, 1.0, scale=0.1, neutral=0.0),
         Parameter("width", "N", 1e-300, 1e300, logarithmic=True),
     ),
-    apply=lambda rig, target, v: _change_actuators(
-        rig, target, hysteresis_share=v["share"], hysteresis_width=v["width"]
-    ),
+    apply=lambda rig, name, v: _change_actuators(rig, name, hysteresis_share=v["share"], hysteresis_width=v["width"]),
     starts=_hysteresis_starts,
     targets=or_all(each_actuator),
     nonlinear=True,
@@ -449,9 +442,7 @@ SENSOR_DRIFT = Kind(
     path="sensor",
     parameters=_reading("drift_over_record"),
     apply=_set("sensors", "drift_over_record", "drift"),
-    starts=lambda reconstruction, target: [
-        {"drift_over_record": 2.0 * float(np.mean(_residual(reconstruction, target)))}
-    ],
+    starts=lambda force, target: [{"drift_over_record": 2.0 * float(np.mean(_residual(force, target)))}],
     targets=each_sensor,
     signed=True,
     phrase="a sensor drift",
@@ -527,9 +518,9 @@ def _swapped_output_starts(reconstruction: Reconstruction, pair: tuple[str, str]
     noise, own, crossed = _noise(reconstruction.rig), 0.0, 0.0
     for name, other in (pair, pair[::-1]):
         residual = _residual(reconstruction, name)
-        measured = _predicted(reconstruction, name) + residual
+        error = _predicted(reconstruction, name) + residual - _predicted(reconstruction, other)
         own += float(residual @ residual) / noise[name] ** 2
-        crossed += float(np.sum((measured - _predicted(reconstruction, other)) ** 2)) / noise[name] ** 2
+        crossed += float(np.sum(error**2)) / noise[name] ** 2
     return [{}] if crossed < own else []
 
 

@@ -251,9 +251,8 @@ def budget_of(
     whole = shares.sum(axis=1).clip(0.0) / max(nominal.sum(), 1e-300)
     whole = whole / max(whole.sum(), 1e-300)
     by_record = {r.name: shares[:, i] / max(nominal[i], 1e-300) for i, r in enumerate(records)}
-    of_inputs = {
-        r.name: float(by_inputs[i] / max(nominal[i], 1e-300)) for i, r in enumerate(records) if by_inputs[i] > 0
-    }
+    input_shares = zip(records, by_inputs / np.maximum(nominal, 1e-300), strict=True)
+    of_inputs = {record.name: float(share) for record, share in input_shares if share > 0}
     return Budget(
         effects={labels[i]: float(share) for i, share in zip(by_size, whole, strict=False)},
         nominal=float(whole[-3]),
@@ -284,9 +283,7 @@ def residual_powers(rig: Rig, effects: Sequence[Effect], records: Sequence[Recor
         return np.full(len(records), DIVERGED)
     # without one of two effects that balance each other, the response may diverge
     with np.errstate(over="ignore", invalid="ignore"):
-        powers = [
-            signal_power(record, record.outputs - simulate_record(corrected, record), transient) for record in records
-        ]
+        powers = [signal_power(r, r.outputs - simulate_record(corrected, r), transient) for r in records]
     return np.array([power if power < DIVERGED else DIVERGED for power in powers])
 
 

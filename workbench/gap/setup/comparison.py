@@ -91,14 +91,6 @@ def band_misfit(measured: Spectra, simulated: Spectra, factor: float = 1.0) -> F
         return np.asarray(np.nan_to_num(misfit, nan=LARGEST_LOG_RATIO + 1.0))
 
 
-def log_ratios(measured: Spectra, simulated: Spectra) -> Floats:
-    """Log of measured over simulated amplitude (n_records, n_signals, n_modes); NaN in bands that are not compared."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        of_y, of_p = (np.log(np.maximum(each.power, 1e-300)) for each in (measured, simulated))
-        ratio = 0.5 * (of_y - of_p)
-    return np.where(compared_bands(measured) & np.isfinite(ratio), ratio, np.nan)
-
-
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """Measured and simulated outputs of records, after the transient.
@@ -194,7 +186,10 @@ class Comparison:
     @cached_property
     def log_ratios(self) -> Floats:
         """Log of measured over simulated amplitude (n_records, n_outputs, n_modes); NaN in bands not compared."""
-        return log_ratios(self.measured_spectra, self.simulated_spectra)
+        with np.errstate(over="ignore", invalid="ignore"):
+            of_y, of_p = (np.log(np.maximum(s.power, 1e-300)) for s in (self.measured_spectra, self.simulated_spectra))
+            ratio = 0.5 * (of_y - of_p)
+        return np.where(compared_bands(self.measured_spectra) & np.isfinite(ratio), ratio, np.nan)
 
     @property
     def n_samples(self) -> int:

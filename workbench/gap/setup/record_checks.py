@@ -45,8 +45,7 @@ def check_records(
 ) -> None:
     """Refuse records, to be fitted or held out, whose channels are not, or cannot be, those of the rig.
 
-    Args:
-        transient: seconds at the start of each record that are not compared.
+    The first `transient` seconds of each record are not compared.
 
     Raises:
         RecordsError: for channels that are not the rig's in its order, a sensor with the wrong sign or in other units,
@@ -67,7 +66,7 @@ def check_alive(
 ) -> None:
     """Refuse records of other channels or few samples, and channels that are saturated or flat: no model is needed.
 
-    Args, Raises: as `check_records`.
+    Raises: as `check_records`.
     """
     channels = ("input", [a.name for a in rig.actuators]), ("output", [s.name for s in rig.sensors])
     for record in (*records, *validation):

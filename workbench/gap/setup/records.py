@@ -54,9 +54,10 @@ def check_disjoint(records: Sequence[Record], validation: Sequence[Record]) -> N
 
 def repeated(records: Sequence[Record]) -> list[SetupFault]:
     """Faults of records that hold the same samples as another; the later one is left out."""
-    faults, repeats = [], set()
+    faults: list[SetupFault] = []
+    repeats: set[int] = set()
     for i, j in combinations(range(len(records)), 2):
-        if j not in repeats and i not in repeats and records[i].repeats(records[j]):
+        if not {i, j} & repeats and records[i].repeats(records[j]):
             repeats.add(j)
             first, second = records[i].name, records[j].name
             sentence = f"The records {first} and {second} hold the same samples: leave {second} out."
