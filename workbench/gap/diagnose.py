@@ -201,14 +201,7 @@ def diagnose(
             units=units,
         )
         notes = notes_of(
-            verdict,
-            records,
-            validation,
-            faults=faults,
-            errors=errors,
-            power=power,
-            transient=transient,
-            seconds=seconds,
+            verdict, records, validation, faults, errors=errors, power=power, transient=transient, seconds=seconds
         )
         return replace(verdict, notes=notes)
 
@@ -271,10 +264,8 @@ def _power_of_difference(
         return np.inf
     one, other = apply_all(rig, effects), apply_all(rig, others)
     with np.errstate(over="ignore", invalid="ignore"):  # without one of two effects in balance, a response may diverge
-        return sum(
-            signal_power(record, simulate_record(one, record) - simulate_record(other, record), transient)
-            for record in held_out
-        )
+        differences = [(record, simulate_record(one, record) - simulate_record(other, record)) for record in held_out]
+        return sum(signal_power(record, difference, transient) for record, difference in differences)
 
 
 def _outcome(found: Attribution, shrinkage: Shrinkage | None, beyond: np.ndarray, disagreeing: Sequence[str]) -> str:

@@ -190,8 +190,8 @@ def _shares_between(edges: np.ndarray, seen: Sequence[tuple[Floats, float, float
 
 def _shares_of_eighths(scaled: Floats) -> Floats:
     """Share of the power in each eighth of a record (8,)."""
-    power: Floats = np.array([(piece**2).sum() for piece in np.array_split(scaled, 8, axis=1)])
-    return power / max(float(power.sum()), 1e-300)
+    power = np.array([(piece**2).sum() for piece in np.array_split(scaled, 8, axis=1)])
+    return np.asarray(power / max(float(power.sum()), 1e-300))
 
 
 def _path(
@@ -199,10 +199,8 @@ def _path(
 ) -> str:
     """Path of the first effect, or a guess from the sensors and inputs that show the gap.
 
-    Args:
-        excess: (n_records, n_outputs) power above the noise, scaled.
-        floors: (n_records,) power of the noise, likewise, the mean over sensors.
-        power: (n_outputs,) above the noise in all records.
+    excess: (n_records, n_outputs) scaled power above the noise; floors: (n_records,) that of the noise, the mean over
+    sensors; power: (n_outputs,) above the noise in all records.
     """
     if effects:
         return effects[0].kind.path
@@ -277,9 +275,7 @@ def linear_share(rig: Rig, seen: Sequence[tuple[Record, Floats]], shares: Floats
     validation, resonators would fit any narrow-band residual, which has few degrees of freedom. A single record is
     halved.
 
-    Args:
-        seen: records with their residuals (n_outputs, n_samples), measured minus predicted.
-        shares: (n_modes,) of the gap around each mode; only the modes with the largest shares are used.
+    shares: (n_modes,) of the gap around each mode; only the modes with the largest shares are used.
     """
     chosen = [int(r) for r in np.argsort(-shares)[: BREAKDOWN.most_modes] if shares[r] > 0]
     sizes = np.sqrt(np.mean([record.outputs.var(axis=1) for record, _ in seen], axis=0))[:, None]

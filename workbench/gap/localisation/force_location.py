@@ -149,13 +149,9 @@ def _refined(reconstruction: ForceReconstruction, top: float) -> float:
     length, spacing = reconstruction.domain.size, reconstruction.places[1] - reconstruction.places[0]
     edge, beside = LOCALISATION.edge * length, RECONSTRUCTION.beside * spacing
     for _ in range(LOCALISATION.rounds):
-        found = minimize_scalar(
-            reconstruction.misfit,
-            bounds=(max(at - beside, edge), min(at + beside, length - edge)),
-            args=(informative,),
-            method="bounded",
-            options={"xatol": LOCALISATION.resolved * spacing},
-        )
+        how: Any = {"method": "bounded", "bounds": (max(at - beside, edge), min(at + beside, length - edge))}
+        tolerance = {"xatol": LOCALISATION.resolved * spacing}
+        found = minimize_scalar(reconstruction.misfit, args=(informative,), options=tolerance, **how)
         moved, at = abs(found.x - at), float(found.x)
         informative = reconstruction.informative(at)
         if moved < LOCALISATION.resolved * spacing:

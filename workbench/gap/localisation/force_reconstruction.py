@@ -296,12 +296,8 @@ class ForceReconstruction:
         """The peak of the log-likelihood near a place of the grid: position and height."""
         spacing = self.places[1] - self.places[0]
         beside, options = RECONSTRUCTION.beside * spacing, {"xatol": RECONSTRUCTION.resolved * spacing}
-        found = minimize_scalar(
-            lambda x: -self._log_likelihood(x, self.size),
-            bounds=(at - beside, at + beside),
-            method="bounded",
-            options=options,
-        )
+        how: Any = {"method": "bounded", "bounds": (at - beside, at + beside), "options": options}
+        found = minimize_scalar(lambda x: -self._log_likelihood(x, self.size), **how)
         return float(found.x), -float(found.fun)
 
     @cached_property

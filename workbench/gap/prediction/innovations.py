@@ -52,10 +52,8 @@ class Observer:
     ) -> "Observer":
         """The observer of a rig with sensors of noise standard deviations `noise` (n_outputs,).
 
-        Args:
-            force: rms of the inputs, N.
-            at, rms: place and rms, N, of a further random force.
-            loose: rms of the process noise forces over that of the inputs: the less, the lower the gain.
+        force: rms of the inputs, N; at, rms: place and rms, N, of a further random force; loose: rms of the process
+        noise forces over that of the inputs: the less, the lower the gain.
         """
         modes, n = rig.modes, rig.modes.n_modes
         domain = modes.domain

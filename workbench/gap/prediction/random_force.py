@@ -126,11 +126,8 @@ def fit_random_force(
 ) -> RandomForceFit:
     """Maximum-likelihood estimate of place, strength and colour, from the best of a grid.
 
-    Args:
-        rig, data: that the force acts on, and the records.
-        residuals: (n_outputs, n_samples) a record, in the sensors' units.
-        places: to start from; for named points, all candidates.
-        size: a typical force, N.
+    residuals: (n_outputs, n_samples) a record, in the sensors' units; places: to start from, for named points all
+    candidates; size: a typical force, N.
     """
     model = sampled_model(rig.modes, rig.sensors, data.noise, data.counted[0].sample_time)
     residuals, domain = list(residuals), rig.modes.domain

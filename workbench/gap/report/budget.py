@@ -73,8 +73,7 @@ def measure(nominal: Rig, corrected: Rig, records: Sequence[Record], *, transien
         lead = lead_of(record, transient)
         measured = record.outputs[:, lead:]
         scale = scale_of(measured)
-        predicted = [simulate_record(rig, record)[:, lead:] for rig in (nominal, corrected)]
-        errors = [((measured - prediction) / scale) ** 2 for prediction in predicted]
+        errors = [((measured - simulate_record(rig, record)[:, lead:]) / scale) ** 2 for rig in (nominal, corrected)]
         noise = np.array([s.noise_std for s in nominal.sensors])[:, None] / scale
         before[record.name], after[record.name] = (float(np.sqrt(e.mean())) for e in errors)
         floor[record.name] = float(np.sqrt((noise**2).mean()))
@@ -220,8 +219,7 @@ def budget_of(
     one another would remove nothing one by one, or less.
 
     Args:
-        effects, errors: that were named, and those of the nominal model; see `with_held_out` for those that vary.
-        records: held out of the fit, or the fitted ones if none were.
+        errors: of the nominal model; see `with_held_out` for those that vary from record to record.
         noise_found: (n_outputs,) estimated standard deviation of each sensor's noise.
         logged: noise of the logged inputs, as a share of their rms.
     """

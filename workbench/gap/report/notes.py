@@ -30,8 +30,8 @@ def notes_of(
     verdict: Verdict,
     records: Sequence[Record],
     validation: Sequence[Record],
-    *,
     faults: Sequence[SetupFault],
+    *,
     errors: Effect | None,
     power: float,
     transient: float,
@@ -39,10 +39,8 @@ def notes_of(
 ) -> tuple[str, ...]:
     """The notes, in the order in which they are stated.
 
-    Args:
-        errors: of the nominal model, those of held-out records included; None if none were fitted.
-        power: mean square of the gap, each sensor scaled by the standard deviation of its readings.
-        seconds: limit of the search.
+    errors: of the nominal model, those of held-out records included; power: mean square of the gap, each sensor scaled
+    by the standard deviation of its readings; seconds: limit of the search.
     """
     found, budget, outcome = verdict.attribution, verdict.budget, verdict.outcome
     notes = [fault.sentence for fault in faults]

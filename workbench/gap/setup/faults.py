@@ -46,9 +46,7 @@ def setup_faults(
     Faults are detected in all fit records together, and each is kept for the records that agree with it; then each
     record is tested for faults of its own.
 
-    Args:
-        records, validation: with the rig's inputs and outputs, in its order.
-        transient: seconds at the start of each record that are not compared.
+    All records have the rig's inputs and outputs, in its order; the first `transient` seconds are not compared.
 
     Raises:
         ValueError: two records of one name.

@@ -150,12 +150,11 @@ def _delay_of(gap: Comparison) -> float | None:
     whole = int(tried[np.argmax(np.fft.irfft(cross, n)[tried])])
     if whole in (tried[0], tried[-1]):
         return None
-    found = minimize_scalar(
-        lambda delay: -float((cross * np.exp(1j * at * delay)).real.sum()),
-        bounds=(whole - 1.0, whole + 1.0),
-        method="bounded",
-    )
-    return float(found.x)
+
+    def loss(delay: float) -> float:
+        return -float((cross * np.exp(1j * at * delay)).real.sum())
+
+    return float(minimize_scalar(loss, bounds=(whole - 1.0, whole + 1.0), method="bounded").x)
 
 
 def _closed(gap: Comparison, delay: float) -> float:
