@@ -47,10 +47,18 @@ def former_arguments(**new_names: str) -> Callable[[Callable[P, R]], Callable[P,
 
 
 def former_fields(**new_names: str) -> Callable[[C], C]:
-    """A class whose constructor takes former names of its arguments too, as of `former_arguments`."""
+    """A dataclass whose fields have former names too, in its constructor and as attributes.
+
+    Args:
+        new_names: by former name.
+    """
 
     def taking(owner: C) -> C:
         owner.__init__ = former_arguments(**new_names)(owner.__init__)  # type: ignore[misc]
+        for old, new in new_names.items():
+            attribute = Renamed(new)
+            attribute.__set_name__(owner, old)
+            setattr(owner, old, attribute)
         return owner
 
     return taking

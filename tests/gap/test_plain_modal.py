@@ -13,7 +13,7 @@ from workbench.draw.gap import ALIKE, plot_unmodelled_force, plot_where
 from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.nominal import NOMINAL_ERRORS
-from workbench.gap.prediction.unmodelled_force import sampled_model, wandering_force_filter
+from workbench.gap.prediction.unmodelled_force import gauss_markov_force_filter, sampled_model
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
@@ -191,7 +191,7 @@ def test_a_limit_and_a_gain_are_found_beside_shapes_that_are_off(spacecraft):
 def test_a_filter_settles_where_rigid_modes_are_read_by_their_rates_alone(spacecraft, place):
     rig, _ = spacecraft
     model = sampled_model(rig.modes, rig.sensors, np.array([s.noise_std for s in rig.sensors]), 0.0115)
-    found = wandering_force_filter(rig.modes, model, rig.modes.phi_at(place), 0.2, 11.5, 0.0115)
+    found = gauss_markov_force_filter(rig.modes, model, rig.modes.phi_at(place), 0.2, 11.5, 0.0115)
     variances = np.linalg.eigvalsh(found.covariance)
     assert variances[0] > -1e-9 * variances[-1]
     assert np.sqrt(variances[-1]) < 100.0  # of a force of 0.2 N

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -50,7 +50,7 @@ from workbench.threads import one_blas_thread
 LIKELY = 0.01  # probability from which an alternative deserves an experiment
 TOLERANCE = 0.01  # of the signal: a smaller gap is not explained
 WORTH = 0.02  # of the residual power of held-out records: an effect that acts there must remove more to be named
-TRIFLE = 0.0005  # of the gap's power there: likewise
+LEAST_SHARE = 0.0005  # of the gap's power there: likewise
 DECISIVE = 10.0  # times the residual with it: an effect without which more is left there is not refitted without
 LEAST_CLOSED = 0.9  # share of the gap to be closed on held-out records
 LARGEST_LEFT = 0.1  # of the noise power there: a larger residual above the noise is significant
@@ -115,8 +115,7 @@ def diagnose(
     if seconds is not None and not seconds > 0:
         raise ValueError(f"a search needs time: seconds must be positive; got {seconds:g}")
     sharing = Workers.at_hand() if workers is None else Workers(workers)
-    allowed = None if seconds is None else SEARCH_SHARE * seconds * (2.0 if sharing.number == 1 else 1.0)
-    deadline = Deadline(allowed)
+    deadline = Deadline(None if seconds is None else SEARCH_SHARE * seconds * (2.0 if sharing.number == 1 else 1.0))
     if not records:
         raise ValueError("a diagnosis needs at least one record to fit; got none")
     shortest = min(record.n_samples * record.sample_time for record in (*records, *validation))
@@ -173,32 +172,24 @@ def diagnose(
         disagreeing = _disagreeing(attribution, shrinkage, validation, transient, tolerance, beyond)
         outcome = _outcome(attribution, shrinkage, beyond, disagreeing)
         errors = next((e for e in accounted if e.kind is NOMINAL_ERRORS), None)
-        named = tuple(e for e in accounted if e is not errors)
-        effects = named if outcome in ("none", "explained") else ()
-        faulty = _faulty(attribution.best.effects)
-        as_given = faulty == _faulty(given)
-        budget_for = partial(
-            budget_of,
-            rig,
-            errors=errors,
-            records=validation or records,
-            noise_found=attribution.noise,
-            transient=transient,
-        )
-        budget = budget_for(effects, logged=_input_noise(attribution, outcome))
-        power = _residual_power(rig, (), validation or records, transient) / len(validation or records)
+        effects = tuple(e for e in accounted if e is not errors) if outcome in ("none", "explained") else ()
+        measured = validation or records
+        how: Any = {"noise_found": attribution.noise, "transient": transient}
+        budget = budget_of(rig, effects, errors, measured, logged=_input_noise(attribution, outcome), **how)
+        power = _residual_power(rig, (), measured, transient) / len(measured)
         if outcome == "explained" and _leaves_unexplained(budget, power, tolerance):
             attribution = replace(attribution, outcome="part")
             outcome, effects = _outcome(attribution, shrinkage, beyond, disagreeing), ()
-            budget = budget_for(effects, logged=_input_noise(attribution, outcome))
-        where = break_down(nominal, effects, place() if as_given else locate_force(nominal.without(faulty)))
+            budget = budget_of(rig, effects, errors, measured, logged=_input_noise(attribution, outcome), **how)
+        faulty = _faulty(attribution.best.effects)
+        located = place() if faulty == _faulty(given) else locate_force(nominal.without(faulty))
         verdict = Verdict(
             case=name,
             outcome=outcome,
             disagreeing=disagreeing,
             effects=attribution.best.effects,
             alternatives=tuple((fit.named, probability) for fit, probability in attribution.alternatives),
-            where=where,
+            where=break_down(nominal, effects, located),
             shrinkage=shrinkage,
             corrected=corrected,
             nominal=rig,
@@ -210,14 +201,7 @@ def diagnose(
             units=units,
         )
         notes = notes_of(
-            verdict,
-            records,
-            validation,
-            faults=faults,
-            errors=errors,
-            power=power,
-            transient=transient,
-            seconds=seconds,
+            verdict, records, validation, faults, errors=errors, power=power, transient=transient, seconds=seconds
         )
         return replace(verdict, notes=notes)
 
@@ -247,17 +231,17 @@ def _validated(rig: Rig, found: Attribution, held_out: Sequence[Record], transie
     if found.outcome != "explained" or len(named) < 2 or not held_out or _unpredictable(found):
         return found
     after = _residual_power(rig, effects, held_out, transient)
-    trifle = max(WORTH * after, TRIFLE * _residual_power(rig, (), held_out, transient))
+    least = max(WORTH * after, LEAST_SHARE * _residual_power(rig, (), held_out, transient))
     for effect in named:
         rest = [e for e in effects if e is not effect]
         if _power_of_difference(rig, effects, rest, held_out, transient) < WORTH * after:
             continue
         # most effects count decisively even with the others unchanged; else the others are refitted
-        if _residual_power(rig, rest, held_out, transient) < DECISIVE * (after + trifle):
+        if _residual_power(rig, rest, held_out, transient) < DECISIVE * (after + least):
             without = found.without(effect)
             if _errors_are_plausible(effects) and not _errors_are_plausible(without.best.effects):
                 continue
-            if _residual_power(rig, without.best.effects, held_out, transient) < after + trifle:
+            if _residual_power(rig, without.best.effects, held_out, transient) < after + least:
                 return _validated(rig, without, held_out, transient)
     return found
 
@@ -280,10 +264,8 @@ def _power_of_difference(
         return np.inf
     one, other = apply_all(rig, effects), apply_all(rig, others)
     with np.errstate(over="ignore", invalid="ignore"):  # without one of two effects in balance, a response may diverge
-        return sum(
-            signal_power(record, simulate_record(one, record) - simulate_record(other, record), transient)
-            for record in held_out
-        )
+        differences = [(record, simulate_record(one, record) - simulate_record(other, record)) for record in held_out]
+        return sum(signal_power(record, difference, transient) for record, difference in differences)
 
 
 def _outcome(found: Attribution, shrinkage: Shrinkage | None, beyond: np.ndarray, disagreeing: Sequence[str]) -> str:
@@ -310,10 +292,7 @@ def _input_noise(found: Attribution, outcome: str) -> float:
 def _leaves_unexplained(budget: Budget, power: float, tolerance: float) -> bool:
     """Whether a set leaves more of the gap unexplained than an explanation may, and more than the tolerance.
 
-    Args:
-        budget: of the set.
-        power: mean square of the gap.
-        tolerance: of the signal's rms.
+    power: mean square of the gap.
     """
     least = max(UNEXPLAINED, LARGEST_LEFT * budget.noise)
     return budget.unexplained > least and budget.unexplained * power > tolerance**2
@@ -370,20 +349,14 @@ def _disagreeing(
     noise = beyond + [noise_power(record, found.noise, transient) for record in held_out]
     chance = [CHANCE * np.sqrt(2.0 / (r.n_outputs * (r.n_samples - lead_of(r, transient)))) for r in held_out]
     tolerated = (1.0 - LEAST_CLOSED_WITH_ERRORS) ** 2 if found.best.effects else 0.0
-    least = np.max(
-        [np.full(len(held_out), tolerance**2), (LARGEST_LEFT + np.array(chance)) * noise, tolerated * (before - noise)],
-        axis=0,
-    )
+    least = np.maximum((LARGEST_LEFT + np.array(chance)) * noise, tolerated * (before - noise)).clip(tolerance**2)
     return tuple(record.name for record, is_gap in zip(held_out, after - noise > least, strict=True) if is_gap)
 
 
 def _over_fits(found: Attribution, shrinkage: Shrinkage | None, beyond: float | Floats = 0.0) -> bool:
     """Whether a set that explains the fitted records leaves much of the gap of held-out records: over-fitting.
 
-    Args:
-        found: the attribution.
-        shrinkage: of the gap on held-out records.
-        beyond: (n_records,) of `_power_beyond_effects`.
+    beyond: (n_records,) of `_power_beyond_effects`.
     """
     if shrinkage is None or _unpredictable(found):
         return False
@@ -391,10 +364,9 @@ def _over_fits(found: Attribution, shrinkage: Shrinkage | None, beyond: float | 
     floor = max(found.noise_ratio, 1.0) ** 2 * floor + beyond
     left, closable = (np.maximum(power - floor, 0.0).sum() for power in (after, before))
     closed = max(shrinkage.overall, 1.0 - float(np.sqrt(left / max(closable, 1e-300))))
-    beside = any(effect.kind is NOMINAL_ERRORS for effect in found.best.effects)
-    return bool((after > (1.0 + LARGEST_LEFT) * floor).any()) and closed < (
-        LEAST_CLOSED_WITH_ERRORS if beside else LEAST_CLOSED
-    )
+    has_errors = any(effect.kind is NOMINAL_ERRORS for effect in found.best.effects)
+    least = LEAST_CLOSED_WITH_ERRORS if has_errors else LEAST_CLOSED
+    return bool((after > (1.0 + LARGEST_LEFT) * floor).any()) and closed < least
 
 
 def _unpredictable(found: Attribution) -> bool:

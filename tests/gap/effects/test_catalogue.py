@@ -229,7 +229,7 @@ def test_rounding_of_all_sensors_is_described_with_their_unit():
     nominal = rig()
     of_one = replace(nominal, sensors=tuple(s for s in nominal.sensors if s.quantity == "displacement"))
     effect = Effect(kind_named("sensor_quantisation"), "all", {"step": 2e-3})
-    assert _described(effect, of_one) == "rounding of a sensor (all: step 0.002 m)"
+    assert _described(effect, of_one) == "quantisation of a sensor (all: step 0.002 m)"
     other = replace(of_one.sensors[0], name="v", quantity="velocity")
     assert "0.002)" in _described(effect, replace(of_one, sensors=(*of_one.sensors, other)))
 
@@ -437,7 +437,7 @@ def test_sets_are_named_in_words():
 
 def test_channels_keep_their_names_in_words():
     """As a file heads its columns."""
-    assert in_words("actuator_gain[drive_1 [N]]") == "a wrong actuator gain (drive_1 [N])"
+    assert in_words("actuator_gain[drive_1 [N]]") == "an actuator gain error (drive_1 [N])"
     assert label_in_words("actuator_gain[drive_1 [N]]") == "actuator gain (drive_1 [N])"
     assert (
         label_in_words("bouc_wen") == "hysteretic spring (Bouc-Wen)"

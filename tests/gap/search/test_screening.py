@@ -14,7 +14,7 @@ from workbench.gap.localisation.force_reconstruction import ForceReconstruction
 from workbench.gap.prediction.innovations import Observer
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
-from workbench.gap.report.budget import RUNAWAY, residual_powers
+from workbench.gap.report.budget import DIVERGED, residual_powers
 from workbench.gap.search.fit import Fit, fit, slopes
 from workbench.gap.search.jointly import fit_from_zero
 from workbench.gap.search.pairs import Pairs, _reconstruction_with
@@ -60,7 +60,7 @@ def test_a_load_that_only_a_stiffer_beam_bears_ends_no_search(rig, search):
     assert can_be(rig, (weaker,)) and -1.0 < weaker.values["tension"] / buckling_load(rig) < -0.9
     assert nearest_possible(rig, (load,), (errors,))[0].values == load.values
     assert _starts(replace(search, held=(errors,)), (load,), ForceReconstruction.of(rig, search.data))
-    assert list(residual_powers(rig, (load,), search.data.records[:1], 0.0)) == [RUNAWAY]
+    assert list(residual_powers(rig, (load,), search.data.records[:1], 0.0)) == [DIVERGED]
     linear = replace(search, data=search.first.stepped(1), quick=search.first.stepped(1), by_mode=True)
     assert np.isfinite(fit_from_zero(Stepwise(linear).search, (load,)).fit.cost)
 

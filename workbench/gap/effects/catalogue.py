@@ -1,22 +1,6 @@
 """The catalogue: every kind of effect that a diagnosis tries.
 
-A kind of your own is another `Kind`; pass `(*CATALOGUE, mine)` to the diagnosis. For a law f(w, v) at a point:
-
-    from workbench.rig.elements import UserLaw
-
-    def law(w, v, p):
-        return -p[0] * w * abs(w)
-
-    mine = Kind(
-        name="quadratic_spring", path="structure", nonlinear=True,
-        parameters=lambda rig, _: (
-            *place_parameters(rig), Parameter("stiffness", "N/m^2", 1e-9, 1e9, logarithmic=True)
-        ),
-        apply=lambda rig, _, v: with_element(rig, UserLaw(place_of(v), law, (v["stiffness"],))),
-        starts=lambda reconstruction, _: [
-            {**place_values(p.at), "stiffness": k} for p in reconstruction.at_peaks for k in (0.1, 1.0, 10.0)
-        ],
-    )
+A kind of your own is another `Kind`, as in docs/how-to/own-effect.md: pass `(*CATALOGUE, mine)` to the diagnosis.
 """
 
 from collections.abc import Iterable

@@ -11,7 +11,7 @@ import numpy as np
 
 from workbench.arrays import Floats
 from workbench.records.record import Record
-from workbench.renamed import Renamed, former_arguments
+from workbench.renamed import former_fields
 from workbench.rig.motion import Motion
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Between, Domain, Location, NamedPoints, Rectangle
@@ -125,6 +125,9 @@ class Parameter:
         return float(np.hypot(value, self.scale)) if self.low < 0 else value
 
 
+Parameters = Callable[[Rig, Any], tuple[Parameter, ...]]
+
+
 def positive(
     name: str, unit: str, size: float, low: float = 1e-12, high: float = 1e12, neutral: float | None = None
 ) -> Parameter:
@@ -140,6 +143,11 @@ def place_parameters(rig: Rig) -> tuple[Parameter, ...]:
     lengths = domain.length if isinstance(domain, Rectangle) else (domain.size,)
     named = zip(domain.coordinates, lengths, strict=True)
     return tuple(Parameter(name, "m", 0.0, length, scale=0.01 * length) for name, length in named)
+
+
+def at_a_place(*of_scales: Callable[[Scales], Parameter]) -> Parameters:
+    """The coordinates of a place, and further parameters from the scales of a rig."""
+    return lambda rig, _: (*place_parameters(rig), *(parameter(Scales.of(rig)) for parameter in of_scales))
 
 
 def place_of(values: Mapping[str, Any]) -> Any:
@@ -217,6 +225,19 @@ class Reconstruction(Protocol):
     def places_to_try(self) -> Sequence[Any]: ...
 
 
+Starts = Callable[[Reconstruction, Any], Iterable[dict[str, Any]]]
+
+
+@former_fields(
+    wider="more_general",
+    alone="exclusive",
+    remainder="unpredictable",
+    settled="without_negligible",
+    stands="fixed_place",
+    first="applied_first",
+    last="applied_last",
+    joined="conjunction",
+)
 @dataclass(frozen=True, eq=False, repr=False)
 class Kind:
     """A kind of effect in the catalogue: all that a diagnosis knows of it, from start values to drawings.
@@ -258,9 +279,9 @@ class Kind:
 
     name: str
     path: str
-    parameters: Callable[[Rig, Any], tuple[Parameter, ...]]
+    parameters: Parameters
     apply: Callable[[Rig, Any, dict[str, Any]], Rig]
-    starts: Callable[[Reconstruction, Any], Iterable[dict[str, Any]]]
+    starts: Starts
     targets: Callable[[Rig], tuple[Any, ...]] = lambda rig: (None,)
     nonlinear: bool = False
     phrase: str = ""
@@ -283,9 +304,6 @@ class Kind:
     applied_first: bool = False
     adds_modes: bool = False
     applied_last: bool = False
-    wider, alone, remainder = Renamed("more_general"), Renamed("exclusive"), Renamed("unpredictable")
-    settled, stands = Renamed("without_negligible"), Renamed("fixed_place")
-    first, last, joined = Renamed("applied_first"), Renamed("applied_last"), Renamed("conjunction")
     known: ClassVar[WeakValueDictionary[int, "Kind"]] = WeakValueDictionary()  # by identity: none is equal to another
 
     def __post_init__(self) -> None:
@@ -300,18 +318,7 @@ class Kind:
         return self.phrase or self.name.replace("_", " ")
 
 
-Kind.__init__ = former_arguments(  # type: ignore[method-assign]
-    wider="more_general",
-    alone="exclusive",
-    remainder="unpredictable",
-    settled="without_negligible",
-    stands="fixed_place",
-    first="applied_first",
-    last="applied_last",
-    joined="conjunction",
-)(Kind.__init__)
-
-
+@former_fields(deviations="std")
 @dataclass(frozen=True, eq=False)
 class Effect:
     """An effect with values of its parameters.
@@ -328,14 +335,11 @@ class Effect:
     values: dict[str, Any]
     std: dict[str, float] = field(default_factory=dict)
 
-    deviations = Renamed("std")
-
     def apply(self, rig: Rig) -> Rig:
         """The rig with the effect."""
         return self.kind.apply(rig, self.target, self.values)
 
     def parameters(self, rig: Rig) -> tuple[Parameter, ...]:
-        """Its parameters on a rig."""
         return self.kind.parameters(rig, self.target)
 
     @property
@@ -376,6 +380,10 @@ class Effect:
         """The same effect at another place."""
         return replace(self, values={**self.values, **place_values(where)})
 
+    def of_kind(self, kind: Kind, **values: float) -> "Effect":
+        """An effect of another kind, without a target, at the same place."""
+        return Effect(kind, None, {**place_values(self.at), **values})
+
     @property
     def words(self) -> str:
         """Its name in a sentence."""
@@ -387,9 +395,6 @@ class Effect:
         """Name of the kind with its target."""
         names = ", ".join(self.target) if type(self.target) is tuple else self.target
         return f"{self.kind.name}[{names}]" if isinstance(names, str | int) else self.kind.name
-
-
-Effect.__init__ = former_arguments(deviations="std")(Effect.__init__)  # type: ignore[method-assign]
 
 
 def names_in(target: Any) -> tuple[str, ...]:
@@ -466,19 +471,25 @@ def with_two_as_one(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
     for one, other in combinations(effects, 2):
         if one.kind is other.kind and one.target == other.target and one.at is not None:
             rest = [effect for effect in effects if effect is not one and effect is not other]
+            names = [name for name in COORDINATES if isinstance(one.values.get(name), float)]
+            middle = {name: 0.5 * (one.values[name] + other.values[name]) for name in names}
             yield (*rest, one)
             yield (*rest, one.moved_to(other.at))
-            names = [name for name in COORDINATES if isinstance(one.values.get(name), float)]
-            if names:
-                middle = {name: 0.5 * (one.values[name] + other.values[name]) for name in names}
+            if middle:
                 yield (*rest, replace(one, values={**one.values, **middle}))
+
+
+def _with_one_replaced(
+    effects: Sequence[Effect], others: Callable[[Effect], Iterable[Effect]]
+) -> Iterator[tuple[Effect, ...]]:
+    """The sets with one effect replaced by each of the others of it."""
+    for i, effect in enumerate(effects):
+        yield from ((*effects[:i], other, *effects[i + 1 :]) for other in others(effect))
 
 
 def with_one_simpler(effects: Sequence[Effect], rig: Rig) -> Iterator[tuple[Effect, ...]]:
     """The sets with one effect replaced by a limiting case."""
-    for i, effect in enumerate(effects):
-        for simpler in simpler_forms(effect, rig):
-            yield (*effects[:i], simpler, *effects[i + 1 :])
+    return _with_one_replaced(effects, lambda effect: simpler_forms(effect, rig))
 
 
 def each_left_out(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
@@ -489,9 +500,7 @@ def each_left_out(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
 
 def more_general_sets(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
     """The sets with one effect replaced by one that it is a limiting case of."""
-    for i, effect in enumerate(effects):
-        for more_general in effect.kind.more_general(effect):
-            yield (*effects[:i], more_general, *effects[i + 1 :])
+    return _with_one_replaced(effects, lambda effect: effect.kind.more_general(effect))
 
 
 def merged_sets(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
@@ -504,9 +513,7 @@ def merged_sets(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
 
 def from_other_starts(effects: Sequence[Effect], rig: Rig) -> Iterator[tuple[Effect, ...]]:
     """The sets with one effect at other start values, where its fit may end in another minimum."""
-    for i, effect in enumerate(effects):
-        for other in effect.kind.other_starts(effect, rig):
-            yield (*effects[:i], other, *effects[i + 1 :])
+    return _with_one_replaced(effects, lambda effect: effect.kind.other_starts(effect, rig))
 
 
 def simpler_sets(effects: Sequence[Effect], rig: Rig) -> Iterator[tuple[Effect, ...]]:

@@ -10,9 +10,8 @@ from workbench.gap.effects.effect import (
     Kind,
     Parameter,
     Reconstruction,
-    Scales,
+    at_a_place,
     place_of,
-    place_parameters,
     place_values,
     positive,
 )
@@ -70,8 +69,7 @@ def _periodic_starts(reconstruction: Reconstruction, _: object) -> Iterator[dict
         frequency, amplitude, phase = tone(mean, sample_time)
         lead = records[0].start_time - reconstruction.data.records[0].start_time
         if lead:  # the phase refers to the start of the record
-            turned = 2.0 * np.pi * frequency * lead
-            phase = float(np.angle(np.exp(1j * (phase - turned))))
+            phase = float(np.angle(np.exp(1j * (phase - 2.0 * np.pi * frequency * lead))))
         if not _is_distortion(frequency, reconstruction.data.records):
             yield {**place_values(place.at), "frequency": frequency, "amplitude": amplitude, "phase": phase}
 
@@ -87,11 +85,10 @@ def _constant(tone: Effect, rig: Rig) -> Iterator[Effect]:
 PERIODIC_DISTURBANCE = Kind(
     name="periodic_disturbance",
     path="environment",
-    parameters=lambda rig, _: (
-        *place_parameters(rig),
-        Parameter("frequency", "Hz", 1e-6 / Scales.of(rig).time, 1e6 / Scales.of(rig).time, logarithmic=True),
-        positive("amplitude", "N", Scales.of(rig).force, 1e-15, 1e9),
-        Parameter("phase", "rad", -20.0, 20.0),
+    parameters=at_a_place(
+        lambda scales: Parameter("frequency", "Hz", 1e-6 / scales.time, 1e6 / scales.time, logarithmic=True),
+        lambda scales: positive("amplitude", "N", scales.force, 1e-15, 1e9),
+        lambda _: Parameter("phase", "rad", -20.0, 20.0),
     ),
     apply=lambda rig, _, v: with_element(rig, PeriodicForce(place_of(v), v["frequency"], v["amplitude"], v["phase"])),
     starts=_periodic_starts,
@@ -104,7 +101,7 @@ PERIODIC_DISTURBANCE = Kind(
 RANDOM_DISTURBANCE = Kind(
     name="random_disturbance",
     path="environment",
-    parameters=lambda rig, _: (*place_parameters(rig), positive("rms", "N", Scales.of(rig).force, 1e-15, 1e9)),
+    parameters=at_a_place(lambda scales: positive("rms", "N", scales.force, 1e-15, 1e9)),
     apply=lambda rig, _, v: with_element(rig, RandomForce(place_of(v), v["rms"])),
     starts=lambda *_: [],  # found from the statistics of the residual
     found_in="residual",

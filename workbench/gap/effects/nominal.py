@@ -31,8 +31,8 @@ from workbench.structure.profile import Profile
 STIFFNESS, TENSION = "stiffness", "axial load"  # the first includes the effect of temperature on a modulus
 EQUAL_WAVES = 9  # cosines up to which all have the same prior; with more, it falls with the square of the wave number
 HALF_WAVES = 3  # beyond so many half waves, as the series of any function with a slope at its ends does
-PROFILE_UNIT, RATIO_UNIT, DELAY_UNIT = 0.01, 0.1, 0.1  # of free coordinates: relative, of a logarithm, of a sample
-PLACE_UNIT = 0.001  # likewise, of the extent
+# units of free coordinates: of a logarithm, of a sample, of the extent; and of other groups, relative
+UNITS, RELATIVE_UNIT = {"damping": 0.1, "delay": 0.1, "place": 0.001}, 0.01
 LARGEST_DELAY = 0.9  # of a sample: bound of a sensor's delay or lead
 JUST_LATE = 1e-3  # of a sample: an accelerometer that is later reads the value before a jump
 NEGLIGIBLE = 1e-9  # of the largest variance of identified errors, normalised: directions below it are left out
@@ -99,7 +99,6 @@ OUTSIDE = ("delay", "gain", "place", "shape", "record")  # groups that do not ch
 
 @lru_cache(maxsize=4096)
 def group_of(parameter: str) -> str:
-    """The group that a parameter of the nominal errors belongs to."""
     return parameter.split("_", 1)[0]
 
 
@@ -154,7 +153,6 @@ class IdentifiedPrior:
 
 
 def _parameters(rig: Rig, prior: NominalPrior | IdentifiedPrior) -> tuple[Parameter, ...]:
-    """The parameters of the nominal errors of a rig."""
     if isinstance(prior, IdentifiedPrior):
         free = range(1, prior.root.shape[1] + 1)
         return tuple(Parameter(f"identified_{k}", "", -BOUND, BOUND, prior_std=1.0) for k in free)
@@ -162,57 +160,45 @@ def _parameters(rig: Rig, prior: NominalPrior | IdentifiedPrior) -> tuple[Parame
 
 
 def _each_parameter(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
-    """The parameters of the nominal errors, group by group."""
     along = isinstance(rig.structure, Structure)
 
-    def with_prior(
-        name: str, std: float, unit: float, low: float = -np.inf, high: float = np.inf, sensor: str = ""
-    ) -> Parameter:
+    def with_prior(name: str, low: float = -np.inf, high: float = np.inf, sensor: str = "") -> Parameter:
+        group, weight = group_of(name), weight_of(name, prior)
+        std, unit = getattr(prior, group), UNITS.get(group, RELATIVE_UNIT)
         # bounds do not shrink with an estimated prior, so that errors of a profile keep their values
-        least = PROFILE_STD if along and group_of(name) in ("stiffness", "mass") else unit
-        reach, unit = BOUND * max(std, least), unit * weight_of(name, prior)
-        prior_std = max(std * weight_of(name, prior) / unit, 1e-6)
+        least = PROFILE_STD if along and group in ("stiffness", "mass") else unit
+        reach, unit = BOUND * max(std, least), unit * weight
+        prior_std = max(std * weight / unit, 1e-6)
         return Parameter(name, "", max(low, -reach), min(high, reach), scale=unit, prior_std=prior_std, sensor=sensor)
 
-    waves = prior.waves if along else 1
-    if prior.stiffness and along:
-        yield from (with_prior(f"stiffness_{k}", prior.stiffness, PROFILE_UNIT) for k in range(waves))
-    if prior.mass:
-        yield from (with_prior(f"mass_{k}", prior.mass, PROFILE_UNIT) for k in range(waves))
-    modes = range(1, rig.modes.n_modes + 1)
-    if prior.frequency:
-        elastic = (r for r in modes if rig.modes.omega[r - 1] > 0)
-        yield from (with_prior(f"frequency_{r}", prior.frequency, PROFILE_UNIT) for r in elastic)
-    if prior.coupling:
-        yield from (
-            with_prior(name, prior.coupling, PROFILE_UNIT) for name, *_ in _couplings(rig.modes.omega.tobytes())
-        )
-    if prior.damping:
-        yield from (with_prior(f"damping_{r}", prior.damping, RATIO_UNIT) for r in modes)
+    waves, modes = prior.waves if along else 1, range(1, rig.modes.n_modes + 1)
+    names = {
+        "stiffness": [f"stiffness_{k}" for k in range(waves if along else 0)],
+        "mass": [f"mass_{k}" for k in range(waves)],
+        "frequency": [f"frequency_{r}" for r in modes if rig.modes.omega[r - 1] > 0],
+        "coupling": [name for name, *_ in _couplings(rig.modes.omega.tobytes())],
+        "damping": [f"damping_{r}" for r in modes],
+    }
+    yield from (with_prior(name) for group in names if getattr(prior, group) for name in names[group])
     if prior.delay:
         for sensor in rig.sensors:
             low = JUST_LATE if sensor.name in prior.late else -LARGEST_DELAY
             high = 0.0 if sensor.name in prior.early else LARGEST_DELAY
-            yield with_prior(f"delay_{sensor.name}", prior.delay, DELAY_UNIT, low, high, sensor.name)
+            yield with_prior(f"delay_{sensor.name}", low, high, sensor.name)
     # a transducer, and the sensor that alone reads its errors
-    transducers: list[tuple[Transducer, str]] = [
-        *((actuator, "") for actuator in rig.actuators),
-        *((sensor, sensor.name) for sensor in rig.sensors),
-    ]
+    transducers: list[tuple[Transducer, str]] = [(actuator, "") for actuator in rig.actuators]
+    transducers += [(sensor, sensor.name) for sensor in rig.sensors]
     if prior.gain:
-        yield from (
-            with_prior(_gain_name(transducer), prior.gain, PROFILE_UNIT, sensor=own) for transducer, own in transducers
-        )
+        yield from (with_prior(_gain_name(transducer), sensor=own) for transducer, own in transducers)
     if prior.place:
         for transducer, own in transducers:
             for name, low, high in zip(_place_names(rig, transducer), *_place_bounds(rig, transducer), strict=True):
-                yield with_prior(name, prior.place, PLACE_UNIT, float(low), float(high), own)
+                yield with_prior(name, float(low), float(high), own)
     if prior.shape:
         for at, own in (*transducers, *((point, "") for point in prior.points)):
-            for name in _shape_names(at, rig.modes.n_modes):
-                yield with_prior(name, prior.shape, PROFILE_UNIT, sensor=own)
+            yield from (with_prior(name, sensor=own) for name in _shape_names(at, rig.modes.n_modes))
     if prior.record:
-        yield from (with_prior(f"record_{name}", prior.record, PROFILE_UNIT) for name in prior.records)
+        yield from (with_prior(f"record_{name}") for name in prior.records)
 
 
 def _with_variation(profile: Profile, amplitudes: np.ndarray, length: float) -> Profile:
@@ -225,6 +211,7 @@ def _with_variation(profile: Profile, amplitudes: np.ndarray, length: float) -> 
     )
 
 
+@solved_once
 def _with_profile_errors(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> Rig:
     """The rig with errors of its profiles, or of its modal mass."""
     stiffness, mass = (np.array(list(in_group(values, group).values())) for group in ("stiffness", "mass"))
@@ -246,15 +233,13 @@ def _with_profile_errors(rig: Rig, prior: NominalPrior, values: dict[str, float]
     return replace(rig, structure=structure, modes=structure.modes(modes.n_modes, tolerance=RESOLUTION))
 
 
-_profiles_solved = solved_once(_with_profile_errors)
-
-
+@solved_once
 def _with_structural_errors(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> Rig:
     """The rig with errors of its structure and modes; only those of profiles require new modes."""
     along = in_group(values, "stiffness", "mass")
     if not isinstance(rig.structure, Structure):
         rig = replace(rig, structure=None)  # later effects must change these modes, not solve the structure again
-    rig = _profiles_solved(rig, prior, along)
+    rig = _with_profile_errors(rig, prior, along)
     if prior.coupling:
         rig = replace(rig, modes=_with_couplings(rig.modes, values))
     structure, modes = rig.structure, rig.modes
@@ -298,11 +283,8 @@ def _with_couplings(modes: Modes, values: dict[str, float]) -> Modes:
         angles[r, s] = angle * values.get(name, 0.0)
     if not angles.any():
         return modes
-    shapes, turn = modes.shapes, expm(angles - angles.T * (modes.omega > 0))
-    return replace(modes, shapes=lambda located, derivative: shapes(located, derivative) @ turn)
-
-
-_structure_solved = solved_once(_with_structural_errors)
+    shapes, rotation = modes.shapes, expm(angles - angles.T * (modes.omega > 0))
+    return replace(modes, shapes=lambda located, derivative: shapes(located, derivative) @ rotation)
 
 
 def _with_errors(rig: Rig, prior: NominalPrior | IdentifiedPrior, values: dict[str, float]) -> Rig:
@@ -313,18 +295,15 @@ def _with_errors(rig: Rig, prior: NominalPrior | IdentifiedPrior, values: dict[s
         if modes.n_modes < kept and made.structure is not None:  # an effect has added modes to the rig
             modes = modes_of(made.structure, kept)
         return replace(rig, modes=modes, structure=made.structure, actuators=made.actuators)
-    rig = _structure_solved(
-        rig, prior, {name: value for name, value in values.items() if group_of(name) not in OUTSIDE}
-    )
+    inside = {name: value for name, value in values.items() if group_of(name) not in OUTSIDE}
+    rig = _with_structural_errors(rig, prior, inside)
     rig = differing(rig, prior.parameter, deviations_of(values))
     transducers: tuple[Transducer, ...] = (*rig.actuators, *rig.sensors)
     units = _shape_units(rig.modes, transducers) if prior.shape else np.zeros((len(transducers), 0))
     if prior.shape and prior.points:
         rig = replace(rig, modes=_modes_with_errors(rig.modes, transducers, prior.points, values))
-    off = [
-        _transducer_with_errors(rig, transducer, unit, prior, values)
-        for transducer, unit in zip(transducers, units, strict=True)
-    ]
+    each = zip(transducers, units, strict=True)
+    off = [_transducer_with_errors(rig, transducer, unit, prior, values) for transducer, unit in each]
     if all(one is other for one, other in zip(transducers, off, strict=True)):
         return rig
     n = len(rig.actuators)
@@ -348,15 +327,7 @@ def _modes_with_errors(
 def _transducer_with_errors(
     rig: Rig, transducer: Any, units: Floats, prior: NominalPrior, values: dict[str, float]
 ) -> Any:
-    """An actuator or a sensor with errors of its place, gain, mode shapes and timing.
-
-    Args:
-        rig: with the modes.
-        transducer: actuator or sensor.
-        units: (n_modes,) units of the shape errors.
-        prior: of the errors.
-        values: of the errors, by name.
-    """
+    """An actuator or a sensor with errors of its place, gain, shapes and timing; units: (n_modes,) of the shapes."""
     changes: dict[str, Any] = {}
     if prior.place:
         errors = tuple([values.get(name, 0.0) for name in _place_names(rig, transducer)])  # shares of the extent
@@ -392,8 +363,8 @@ def _place_bounds(rig: Rig, transducer: Transducer) -> Floats:
     """Lower and upper bounds (2, n_coordinates) of the error of a transducer's place, as shares of the extent."""
     domain = rig.modes.domain
     assert not isinstance(domain, NamedPoints)
-    room: Floats = (np.array(reach(domain, transducer.at)) - np.asarray(middle(transducer.at), float)) / domain.size
-    return room
+    ends = np.array(reach(domain, transducer.at))
+    return np.asarray((ends - np.asarray(middle(transducer.at), float)) / domain.size)
 
 
 @lru_cache(maxsize=64)
@@ -402,10 +373,8 @@ def _shape_units(modes: Modes, transducers: tuple[Transducer, ...]) -> Floats:
 
     Cached: not to be written to.
     """
-    shapes, kinds = (
-        np.array([shape_of(modes, transducer) for transducer in transducers]),
-        [derivative_of(transducer) for transducer in transducers],
-    )
+    shapes = np.array([shape_of(modes, transducer) for transducer in transducers])
+    kinds = [derivative_of(transducer) for transducer in transducers]
     rms = {kind: np.sqrt((shapes[np.array(kinds) == kind] ** 2).mean(axis=0)) for kind in set(kinds)}
     return np.array([rms[kind] for kind in kinds])
 
@@ -441,7 +410,7 @@ def parted(errors: Effect) -> tuple[Effect, Effect | None]:
         return errors, None
     between = in_group(errors.values, "record")
     alike = {name: value for name, value in errors.values.items() if name not in between}
-    others: dict[str, Any] = {group: 0.0 for group in prior.groups if group != "record"}
+    others: dict[str, Any] = dict.fromkeys(set(prior.groups) - {"record"}, 0.0)
     return (
         replace(errors, target=replace(prior, record=0.0), values=alike),
         replace(errors, target=replace(prior, **others), values=between),
@@ -459,13 +428,7 @@ def _values_by_mode(values: dict[str, float], group: str, n_modes: int) -> Float
 
 
 def nominal_errors(rig: Rig, prior: NominalPrior | IdentifiedPrior, start: Mapping[str, float] | None = None) -> Effect:
-    """Nominal errors as an effect, to be fitted jointly with others.
-
-    Args:
-        rig: nominal.
-        prior: of the errors.
-        start: start values by name; all others are zero.
-    """
+    """Nominal errors as an effect, to be fitted jointly with others; start: values by name, all others zero."""
     values = {p.name: float(np.clip((start or {}).get(p.name, 0.0), p.low, p.high)) for p in _parameters(rig, prior)}
     return Effect(NOMINAL_ERRORS, prior, values)
 
@@ -506,12 +469,9 @@ def varying_parameters(rig: Rig) -> tuple[str, ...]:
 
 
 def differing(rig: Rig, parameter: str, deviations: Mapping[str, float]) -> Rig:
-    """The rig with a parameter that varies from record to record.
+    """The rig with a parameter, of `varying_parameters`, that varies from record to record.
 
-    Args:
-        rig: nominal.
-        parameter: the parameter, of `varying_parameters`.
-        deviations: by name of record: relative for the stiffness, over the buckling load for the axial load.
+    deviations: by name of record: relative for the stiffness, over the buckling load for the axial load.
     """
 
     def change(deviation: float) -> OfOneRecord:

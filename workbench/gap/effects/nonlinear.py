@@ -9,12 +9,14 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.gap.effects.effect import (
     Effect,
+    ForceAndMotion,
     Kind,
     Parameter,
     Reconstruction,
     Scales,
+    Starts,
+    at_a_place,
     place_of,
-    place_parameters,
     place_values,
     positive,
 )
@@ -43,31 +45,39 @@ NEGLIGIBLE_SPEED = 0.1  # factor on a smoothing speed that the records cannot di
 
 
 def with_element(rig: Rig, element: Element) -> Rig:
-    """The rig with one more element."""
     return replace(rig, elements=(*rig.elements, element))
+
+
+def _at_peaks(start: Callable[[ForceAndMotion], Iterable[dict[str, float]]]) -> Starts:
+    """Start values at each of the likeliest places, from the unmodelled force and the motion there."""
+    return lambda reconstruction, _: (
+        {**place_values(place.at), **values} for place in reconstruction.at_peaks for values in start(place)
+    )
+
+
+def _rms(motion: Floats) -> float:
+    return float(np.sqrt(np.mean(motion**2)))
 
 
 # --- cubic_spring
 
 
-def _cubic_starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
-    for place in reconstruction.at_peaks:
-        k = place.strength_along(place.displacement**3)
-        for share in (0.3, 1.0, -1.0, 3.0):
-            yield {**place_values(place.at), "stiffness": share * k}
+def _cubic_starts(place: ForceAndMotion) -> list[dict[str, float]]:
+    k = place.strength_along(place.displacement**3)
+    return [{"stiffness": share * k} for share in (0.3, 1.0, -1.0, 3.0)]
 
 
-def _cubic_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
-    unit = Scales.of(rig).stiffness / Scales.of(rig).length ** 2
-    return (*place_parameters(rig), Parameter("stiffness", "N/m^3", -1e15 * unit, 1e15 * unit, scale=unit, neutral=0.0))
+def _cubic_stiffness(scales: Scales) -> Parameter:
+    unit = scales.stiffness / scales.length**2
+    return Parameter("stiffness", "N/m^3", -1e15 * unit, 1e15 * unit, scale=unit, neutral=0.0)
 
 
 CUBIC_SPRING = Kind(
     name="cubic_spring",
     path="structure",
-    parameters=_cubic_parameters,
+    parameters=at_a_place(_cubic_stiffness),
     apply=lambda rig, _, v: with_element(rig, CubicSpring(place_of(v), v["stiffness"])),
-    starts=_cubic_starts,
+    starts=_at_peaks(_cubic_starts),
     nonlinear=True,
     force_laws={"displacement": lambda v, w: -v["stiffness"] * w**3},
     phrase="a cubic spring",
@@ -97,7 +107,7 @@ MIDPLANE_STRETCHING = Kind(
     starts=_stretching_starts,
     targets=lambda rig: (None,) if isinstance(rig.structure, Structure) else (),
     nonlinear=True,
-    phrase="stretching of the midplane",
+    phrase="midplane stretching",
 )
 
 
@@ -135,50 +145,41 @@ AIR_DRAG = Kind(
 # --- clearance and one_sided_stop
 
 
-def _contact_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
-    scales = Scales.of(rig)
-    stiffness = positive("stiffness", "N/m", scales.stiffness, neutral=0.0)
-    return (*place_parameters(rig), stiffness, positive("gap", "m", scales.length))
+def _stiffness(scales: Scales) -> Parameter:
+    return positive("stiffness", "N/m", scales.stiffness, neutral=0.0)
 
 
-def _contact_starts(two_sided: bool) -> Callable[[Reconstruction, object], Iterator[dict[str, Any]]]:
-    def starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
-        for place in reconstruction.at_peaks:
-            reach = np.abs(place.displacement) if two_sided else place.displacement
-            if not (reach > 0).any():  # the motion stays on the other side, as under a constant force
-                continue
-            levels = np.quantile(reach[reach > 0], (0.3, 0.5, 0.65, 0.8, 0.9, 0.96, 0.99))
-            for gap in levels:
-                over = np.maximum(reach - gap, 0.0) * np.sign(place.displacement)
-                k = place.strength_along(over)
-                for share in (1.0, 4.0) if k > 0 else ():
-                    yield {**place_values(place.at), "stiffness": share * k, "gap": float(gap)}
-
-    return starts
+def _smoothing_speed(scales: Scales) -> Parameter:
+    return positive("smoothing_speed", "m/s", scales.speed)
 
 
-def _without_gap(effect: Effect, _: Rig) -> tuple[Effect, ...]:
-    return (Effect(GROUND_SPRING, None, {**place_values(effect.at), "stiffness": effect.values["stiffness"]}),)
+def _contact_starts(place: ForceAndMotion, reach: Floats) -> Iterator[dict[str, float]]:
+    """Start values of a contact that closes at quantiles of the displacement towards it, `reach` (n_total,)."""
+    if not (reach > 0).any():  # the motion stays on the other side, as under a constant force
+        return
+    for gap in np.quantile(reach[reach > 0], (0.3, 0.5, 0.65, 0.8, 0.9, 0.96, 0.99)):
+        k = place.strength_along(np.maximum(reach - gap, 0.0) * np.sign(place.displacement))
+        yield from ({"stiffness": share * k, "gap": float(gap)} for share in (1.0, 4.0) if k > 0)
 
 
 CLEARANCE = Kind(
     name="clearance",
     path="structure",
-    parameters=_contact_parameters,
+    parameters=at_a_place(_stiffness, lambda scales: positive("gap", "m", scales.length)),
     apply=lambda rig, _, v: with_element(rig, Clearance(place_of(v), v["stiffness"], v["gap"])),
-    starts=_contact_starts(True),
+    starts=_at_peaks(lambda place: _contact_starts(place, np.abs(place.displacement))),
     nonlinear=True,
-    simpler=_without_gap,
+    simpler=lambda contact, _: (contact.of_kind(GROUND_SPRING, stiffness=contact.values["stiffness"]),),
     force_laws={"displacement": lambda v, w: -v["stiffness"] * np.sign(w) * np.maximum(np.abs(w) - v["gap"], 0.0)},
-    phrase="a clearance closed on both sides by springs",
+    phrase="a two-sided clearance",
 )
 
 ONE_SIDED_STOP = Kind(
     name="one_sided_stop",
     path="structure",
-    parameters=_contact_parameters,
+    parameters=at_a_place(_stiffness, lambda scales: positive("gap", "m", scales.length)),
     apply=lambda rig, _, v: with_element(rig, OneSidedStop(place_of(v), v["stiffness"], v["gap"])),
-    starts=_contact_starts(False),
+    starts=_at_peaks(lambda place: _contact_starts(place, place.displacement)),
     nonlinear=True,
     force_laws={"displacement": lambda v, w: -v["stiffness"] * np.maximum(w - v["gap"], 0.0)},
     phrase="a one-sided stop",
@@ -188,19 +189,16 @@ ONE_SIDED_STOP = Kind(
 # --- coulomb_friction
 
 
-def _friction_starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
-    for place in reconstruction.at_peaks:
-        speed = float(np.sqrt(np.mean(place.velocity**2)))
-        for share in (0.02, 0.1, 0.3):
-            force = place.strength_along(np.tanh(place.velocity / (share * speed)))
-            for part in (1.0, 2.0) if force > 0 else ():
-                yield {**place_values(place.at), "force": part * force, "smoothing_speed": share * speed}
+def _friction_starts(place: ForceAndMotion) -> Iterator[dict[str, float]]:
+    for speed in np.array([0.02, 0.1, 0.3]) * _rms(place.velocity):
+        force = place.strength_along(np.tanh(place.velocity / speed))
+        yield from ({"force": part * force, "smoothing_speed": float(speed)} for part in (1.0, 2.0) if force > 0)
 
 
 def _as_damper(friction: Effect, _: Rig) -> tuple[Effect, ...]:
     """The viscous damper that friction is far below its smoothing speed."""
     coefficient = friction.values["force"] / friction.values["smoothing_speed"]
-    return (Effect(POINT_DAMPER, None, {**place_values(friction.at), "coefficient": coefficient}),)
+    return (friction.of_kind(POINT_DAMPER, coefficient=coefficient),)
 
 
 def _has_negligible_speed(friction: Effect) -> bool:
@@ -214,8 +212,8 @@ def _has_negligible_speed(friction: Effect) -> bool:
 
 def _stated_numbers(friction: Effect, _: Rig) -> dict[str, float]:
     """The parameters of friction, without a smoothing speed that cannot be distinguished from zero."""
-    numbers = friction.numbers
-    return {name: v for name, v in numbers.items() if name != "smoothing_speed" or not _has_negligible_speed(friction)}
+    left_out = ("smoothing_speed",) if _has_negligible_speed(friction) else ()
+    return {name: value for name, value in friction.numbers.items() if name not in left_out}
 
 
 def _with_negligible_speed(friction: Effect) -> Effect:
@@ -229,34 +227,26 @@ def _with_negligible_speed(friction: Effect) -> Effect:
     )
 
 
-def _direction_dependent(friction: Effect) -> tuple[Effect, ...]:
-    force = friction.values["force"]
-    numbers = {**friction.values, "force_forward": force, "force_backward": force}
-    return (Effect(TWO_WAY_FRICTION, None, {n: v for n, v in numbers.items() if n != "force"}),)
+def _direction_dependent(friction: Effect, offset: float = 0.0) -> Effect:
+    values = _two_way_values(friction.values["force"], offset, friction.values["smoothing_speed"])
+    return friction.of_kind(TWO_WAY_FRICTION, **values)
 
 
 def _merged_with_bias(friction: Effect, other: Effect) -> Effect | None:
     """Friction and a constant force as direction-dependent friction, which an offset of a drive looks like."""
-    if other.kind is not ACTUATOR_BIAS:
+    if other.kind is not ACTUATOR_BIAS or abs(other.values["force"]) >= friction.values["force"]:
         return None
-    (both,), force, offset = _direction_dependent(friction), friction.values["force"], other.values["force"]
-    if abs(offset) >= force:
-        return None
-    return replace(both, values={**both.values, "force_forward": force - offset, "force_backward": force + offset})
+    return _direction_dependent(friction, -other.values["force"])
 
 
 COULOMB_FRICTION = Kind(
     name="coulomb_friction",
     path="structure",
-    parameters=lambda rig, _: (
-        *place_parameters(rig),
-        positive("force", "N", Scales.of(rig).force, neutral=0.0),
-        positive("smoothing_speed", "m/s", Scales.of(rig).speed),
-    ),
+    parameters=at_a_place(lambda scales: positive("force", "N", scales.force, neutral=0.0), _smoothing_speed),
     apply=lambda rig, _, v: with_element(rig, CoulombFriction(place_of(v), v["force"], v["smoothing_speed"])),
-    starts=_friction_starts,
+    starts=_at_peaks(_friction_starts),
     nonlinear=True,
-    more_general=_direction_dependent,
+    more_general=lambda friction: (_direction_dependent(friction),),
     merged=_merged_with_bias,
     simpler=_as_damper,
     force_laws={"velocity": lambda v, u: -v["force"] * np.tanh(u / v["smoothing_speed"])},
@@ -273,46 +263,43 @@ def _bouc_wen_starts(reconstruction: Reconstruction, _: object) -> Iterator[dict
     # with named points, the likeliest places need not be close to the right one, which may come third
     most = None if isinstance(reconstruction.rig.modes.domain, NamedPoints) else 2
     for place in reconstruction.at_peaks[:most]:
-        size = float(np.sqrt(np.mean(place.displacement**2)))
+        size = _rms(place.displacement)
         for share in (0.03, 0.1, 0.3, 1.0, 3.0):
             k = place.strength_along(hysteresis(place.displacement, share * size))
             for part in (1.0, 2.0) if k > 0 else ():
                 yield {**place_values(place.at), "stiffness": part * k, "yield_displacement": share * size}
 
 
-def _as_friction(spring: Effect, rig: Rig) -> tuple[Effect, ...]:
-    """The friction that a hysteretic spring is if it always slides: z reverses over about twice its largest value."""
-    v = spring.values
-    speed = v["yield_displacement"] / Scales.of(rig).time
-    numbers = {"force": v["stiffness"] * v["yield_displacement"], "smoothing_speed": speed}
-    return (Effect(COULOMB_FRICTION, None, {**place_values(spring.at), **numbers}),)
+def _as_spring_or_friction(spring: Effect, rig: Rig) -> tuple[Effect, ...]:
+    """The spring that a hysteretic spring is if it never yields, and the friction if it always slides.
+
+    Its internal variable z reverses over about twice its largest value.
+    """
+    stiffness, limit = spring.values["stiffness"], spring.values["yield_displacement"]
+    speed = limit / Scales.of(rig).time
+    friction = spring.of_kind(COULOMB_FRICTION, force=stiffness * limit, smoothing_speed=speed)
+    return (spring.of_kind(GROUND_SPRING, stiffness=stiffness), friction)
 
 
 BOUC_WEN = Kind(
     name="bouc_wen",
     path="structure",
-    parameters=lambda rig, _: (
-        *place_parameters(rig),
-        positive("stiffness", "N/m", Scales.of(rig).stiffness, neutral=0.0),
-        positive("yield_displacement", "m", Scales.of(rig).length),
-    ),
+    parameters=at_a_place(_stiffness, lambda scales: positive("yield_displacement", "m", scales.length)),
     apply=lambda rig, _, v: with_element(rig, BoucWen(place_of(v), v["stiffness"], v["yield_displacement"])),
     starts=_bouc_wen_starts,
     nonlinear=True,
-    simpler=lambda spring, rig: (*_without_gap(spring, rig), *_as_friction(spring, rig)),
+    simpler=_as_spring_or_friction,
     phrase="a hysteretic spring",
 )
 
 # --- joint_slip
 
 
-def _slip_starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
-    for place in reconstruction.at_peaks:
-        size = float(np.sqrt(np.mean(place.displacement**2)))
-        for share in (0.03, 0.1, 0.3, 1.0, 3.0) if isinstance(place.at, Between) else ():
-            k = -place.strength_along(place.displacement - hysteresis(place.displacement, share * size))
-            for part in (0.5, 1.0) if k > 0 else ():
-                yield {**place_values(place.at), "stiffness": part * k, "yield_displacement": share * size}
+def _slip_starts(place: ForceAndMotion) -> Iterator[dict[str, float]]:
+    for share in (0.03, 0.1, 0.3, 1.0, 3.0) if isinstance(place.at, Between) else ():
+        limit = share * _rms(place.displacement)
+        k = -place.strength_along(place.displacement - hysteresis(place.displacement, limit))
+        yield from ({"stiffness": part * k, "yield_displacement": limit} for part in (0.5, 1.0) if k > 0)
 
 
 def _with_slip(rig: Rig, _: object, v: dict[str, Any]) -> Rig:
@@ -323,102 +310,88 @@ def _with_slip(rig: Rig, _: object, v: dict[str, Any]) -> Rig:
     )
 
 
-def _as_stiffness_loss(joint: Effect, _: Rig) -> tuple[Effect, ...]:
-    """The loss of stiffness that a joint is if it always slips."""
-    return (Effect(GROUND_SPRING, None, {**place_values(joint.at), "stiffness": -joint.values["stiffness"]}),)
-
-
 JOINT_SLIP = Kind(
     name="joint_slip",
     path="structure",
     parameters=BOUC_WEN.parameters,
     apply=_with_slip,
-    starts=_slip_starts,
+    starts=_at_peaks(_slip_starts),
     targets=lambda rig: (None,) if isinstance(rig.modes.domain, NamedPoints) and any(rig.modes.domain.pairs()) else (),
     nonlinear=True,
-    simpler=_as_stiffness_loss,
+    simpler=lambda joint, _: (joint.of_kind(GROUND_SPRING, stiffness=-joint.values["stiffness"]),),  # always slipping
     phrase="a joint that slips",
 )
 
 # --- two_way_friction
 
 
-def _two_way_starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
-    for place in reconstruction.at_peaks:
-        speed = float(np.sqrt(np.mean(place.velocity**2)))
-        for share in (0.02, 0.1, 0.3):
-            basis = np.column_stack([np.tanh(place.velocity / (share * speed)), np.ones(place.velocity.size)])
-            force, offset = -np.linalg.lstsq(basis, place.force, rcond=None)[0]
-            if force > abs(offset):
-                both = {"force_forward": force + offset, "force_backward": force - offset}
-                yield {**place_values(place.at), **both, "smoothing_speed": share * speed}
+def _two_way_starts(place: ForceAndMotion) -> Iterator[dict[str, float]]:
+    for speed in np.array([0.02, 0.1, 0.3]) * _rms(place.velocity):
+        basis = np.column_stack([np.tanh(place.velocity / speed), np.ones(place.velocity.size)])
+        force, offset = -np.linalg.lstsq(basis, place.force, rcond=None)[0]
+        if force > abs(offset):
+            yield _two_way_values(force, offset, float(speed))
 
 
-def _force_and_offset(v: Mapping[str, Any]) -> tuple[float, float]:
-    """Mean friction force of both directions, and half their difference, N."""
-    return 0.5 * (v["force_forward"] + v["force_backward"]), 0.5 * (v["force_forward"] - v["force_backward"])
-
-
-def _as_coulomb_friction(friction: Effect, _: Rig) -> tuple[Effect, ...]:
-    numbers = {
-        "force": _force_and_offset(friction.values)[0],
-        "smoothing_speed": friction.values["smoothing_speed"],
-    }
-    return (Effect(COULOMB_FRICTION, None, {**place_values(friction.at), **numbers}),)
+def _two_way_values(force: float, offset: float, speed: float) -> dict[str, float]:
+    """Values of direction-dependent friction of a mean force and half the difference of both directions, N."""
+    return {"force_forward": force + offset, "force_backward": force - offset, "smoothing_speed": speed}
 
 
 def _two_way_element(v: Mapping[str, Any]) -> CoulombFriction:
-    force, offset = _force_and_offset(v)
+    """Friction of the mean force of both directions, N, with half their difference as an offset."""
+    force, offset = (0.5 * (v["force_forward"] + sign * v["force_backward"]) for sign in (1.0, -1.0))
     return CoulombFriction(place_of(v), force, v["smoothing_speed"], offset)
 
 
 def _two_way_law(v: Mapping[str, Any], u: Floats) -> Floats:
-    force, offset = _force_and_offset(v)
-    return -force * np.tanh(u / float(v["smoothing_speed"])) - offset
+    friction = _two_way_element(v)
+    return -friction.force * np.tanh(u / float(friction.smoothing_speed)) - friction.offset
+
+
+def _as_coulomb_friction(friction: Effect, _: Rig) -> tuple[Effect, ...]:
+    mean = _two_way_element(friction.values)
+    return (friction.of_kind(COULOMB_FRICTION, force=mean.force, smoothing_speed=mean.smoothing_speed),)
 
 
 TWO_WAY_FRICTION = Kind(
     name="two_way_friction",
     path="structure",
-    parameters=lambda rig, _: (
-        *place_parameters(rig),
-        positive("force_forward", "N", Scales.of(rig).force, neutral=0.0),
-        positive("force_backward", "N", Scales.of(rig).force, neutral=0.0),
-        positive("smoothing_speed", "m/s", Scales.of(rig).speed),
+    parameters=at_a_place(
+        lambda scales: positive("force_forward", "N", scales.force, neutral=0.0),
+        lambda scales: positive("force_backward", "N", scales.force, neutral=0.0),
+        _smoothing_speed,
     ),
     apply=lambda rig, _, v: with_element(rig, _two_way_element(v)),
-    starts=_two_way_starts,
+    starts=_at_peaks(_two_way_starts),
     nonlinear=True,
     simpler=_as_coulomb_friction,
     force_laws={"velocity": _two_way_law},
     numbers=_stated_numbers,
     without_negligible=_with_negligible_speed,
-    phrase="Coulomb friction that differs between the two directions",
+    phrase="direction-dependent Coulomb friction",
 )
 
 
 # --- quadratic_damper
 
 
-def _quadratic_starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
-    for place in reconstruction.at_peaks:
-        c = place.strength_along(np.abs(place.velocity) * place.velocity)
-        for share in (0.4, 1.0, 2.5) if c > 0 else ():
-            yield {**place_values(place.at), "coefficient": share * c}
+def _quadratic_starts(place: ForceAndMotion) -> list[dict[str, float]]:
+    c = place.strength_along(np.abs(place.velocity) * place.velocity)
+    return [{"coefficient": share * c} for share in (0.4, 1.0, 2.5) if c > 0]
 
 
 QUADRATIC_DAMPER = Kind(
     name="quadratic_damper",
     path="structure",
-    parameters=lambda rig, _: (
-        *place_parameters(rig),
-        positive("coefficient", "N s^2/m^2", Scales.of(rig).damping / Scales.of(rig).speed, neutral=0.0),
+    parameters=at_a_place(
+        lambda scales: positive("coefficient", "N s^2/m^2", scales.damping / scales.speed, neutral=0.0)
     ),
     apply=lambda rig, _, v: with_element(rig, PowerDamper(place_of(v), v["coefficient"], 1.0, 2.0)),
-    starts=_quadratic_starts,
+    starts=_at_peaks(_quadratic_starts),
     nonlinear=True,
     force_laws={"velocity": lambda v, u: -v["coefficient"] * np.abs(u) * u},
-    phrase="a damper quadratic in velocity",
+    phrase="a quadratic damper",
 )
 
 KINDS = (
@@ -439,35 +412,30 @@ EXPONENTS = (1.5, 2.0, 4.0, 6.0)  # start values
 SAME_POWER = 0.05  # an exponent as close as this to that of a kind of the catalogue is the same within small errors
 
 
-def _power_force(v: Mapping[str, Any], motion: Floats) -> Floats:
-    """-F |w / w_r|^p."""
-    force, rms, exponent = float(v["force_at_rms"]), float(v["rms"]), float(v["exponent"])
-    return -force * np.abs(motion / rms) ** exponent
-
-
 def _power_law(element: type, name: str, motion: str, words: str, *, even: bool = False) -> Kind:
-    def starts(reconstruction: Reconstruction, _: object) -> Iterator[dict[str, Any]]:
-        for place in reconstruction.at_peaks:
-            path = getattr(place, motion)
-            rms = float(np.sqrt(np.mean(path**2)))
-            for exponent in EXPONENTS if rms > 0 else ():
-                basis = (1.0 if even else np.sign(path)) * np.abs(path / rms) ** exponent
-                force = place.strength_along(basis)
-                yield {**place_values(place.at), "force_at_rms": force, "exponent": exponent, "rms": rms}
+    def power(u: Floats, rms: float, exponent: float) -> Floats:
+        """±|u / rms|^p."""
+        return np.asarray((1.0 if even else np.sign(u)) * np.abs(u / rms) ** exponent)
+
+    def starts(place: ForceAndMotion) -> Iterator[dict[str, float]]:
+        path = getattr(place, motion)
+        rms = _rms(path)
+        for exponent in EXPONENTS if rms > 0 else ():
+            force = place.strength_along(power(path, rms, exponent))
+            yield {"force_at_rms": force, "exponent": exponent, "rms": rms}
 
     return Kind(
         name=name,
         path="structure",
-        parameters=lambda rig, _: (
-            *place_parameters(rig),
-            Parameter("force_at_rms", "N", -1e15 * Scales.of(rig).force, 1e15 * Scales.of(rig).force),
-            Parameter("exponent", "", 1.0, 9.0),
+        parameters=at_a_place(
+            lambda scales: Parameter("force_at_rms", "N", -1e15 * scales.force, 1e15 * scales.force),
+            lambda _: Parameter("exponent", "", 1.0, 9.0),
         ),
         apply=lambda rig, _, v: with_element(rig, element(place_of(v), v["force_at_rms"], v["rms"], v["exponent"])),
-        starts=starts,
+        starts=_at_peaks(starts),
         nonlinear=True,
         phrase=words,
-        force_laws={motion: lambda v, u: (1.0 if even else np.sign(u)) * _power_force(v, u)},
+        force_laws={motion: lambda v, u: -v["force_at_rms"] * power(u, v["rms"], v["exponent"])},
     )
 
 
@@ -491,7 +459,7 @@ def in_catalogue(law: Effect) -> Effect | None:
     if (law.kind, power) not in POWERS or abs(v["exponent"] - power) > SAME_POWER:
         return None
     kind, number = POWERS[law.kind, power]
-    return Effect(kind, None, {**place_values(law.at), number: v["force_at_rms"] / v["rms"] ** power})
+    return law.of_kind(kind, **{number: v["force_at_rms"] / v["rms"] ** power})
 
 
 def any_beyond(effects: Iterable[Effect]) -> bool:

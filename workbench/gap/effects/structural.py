@@ -13,6 +13,7 @@ from workbench.gap.effects.effect import (
     Parameter,
     Reconstruction,
     Scales,
+    at_a_place,
     place_of,
     place_parameters,
     place_values,
@@ -51,10 +52,7 @@ def modes_of(structure: Structure | Plate | Membrane, n_modes: int) -> Modes:
 def _modes_of_surface(surface: Plate | Membrane, n_modes: int, solved_for: int = 0) -> Modes:
     """The modes of a plate or membrane with attachments, from cached modes without them.
 
-    Args:
-        surface: with its attachments.
-        n_modes: number of modes.
-        solved_for: number of modes that the cached solution is made for; 0 for `n_modes`.
+    solved_for: number of modes that the cached solution is made for; 0 for `n_modes`.
     """
     facts = {f.name: getattr(surface, f.name) for f in fields(surface) if f.name != "attachments"}
     facts["edges"] = tuple(surface.edges.items())
@@ -154,25 +152,18 @@ def _with_attachment(rig: Rig, part: Attachment) -> Rig:
 
 
 def _modulus(rig: Rig, _: object, values: dict[str, float]) -> Rig:
-    factor = values["factor"]
-    if rig.structure is None:
-        return replace(rig, modes=_scaled_modes(rig.modes, np.sqrt(factor)))
-    if isinstance(rig.structure, Plate | Membrane):
-        return _with_scaled_stiffness(rig, rig.structure, factor)
-    scaled: dict[str, Any] = {rig.structure.stiffness_name: rig.structure.stiffness.scaled(factor)}
-    structure = replace(rig.structure, **scaled)
-    if structure.attachments or (isinstance(structure, Beam) and structure.tension):
-        return resolved(rig, structure)
-    if any(0 < s < HELD for end in (structure.left, structure.right) for s in (end.translation, end.rotation)):
+    factor, structure = values["factor"], rig.structure
+    if structure is None or isinstance(structure, Membrane):  # all stiffness of a membrane is scaled
+        return replace(rig, structure=None, modes=_scaled_modes(rig.modes, np.sqrt(factor)))
+    if isinstance(structure, Plate):
+        return resolved(rig, replace(structure, bending_stiffness=structure.bending_stiffness.scaled(factor)))
+    scaled: dict[str, Any] = {structure.stiffness_name: structure.stiffness.scaled(factor)}
+    structure = replace(structure, **scaled)
+    supports = [stiffness for end in (structure.left, structure.right) for stiffness in (end.translation, end.rotation)]
+    has_tension = isinstance(structure, Beam) and structure.tension
+    if structure.attachments or has_tension or any(0 < stiffness < HELD for stiffness in supports):
         return resolved(rig, structure)
     return replace(rig, structure=structure, modes=_scaled_modes(rig.modes, np.sqrt(factor)))
-
-
-def _with_scaled_stiffness(rig: Rig, surface: Plate | Membrane, factor: float) -> Rig:
-    """The rig with `factor` times a plate's bending stiffness, or times all stiffness of a membrane."""
-    if isinstance(surface, Membrane):
-        return replace(rig, structure=None, modes=_scaled_modes(rig.modes, np.sqrt(factor)))
-    return resolved(rig, replace(surface, bending_stiffness=surface.bending_stiffness.scaled(factor)))
 
 
 def _scaled_modes(modes: Modes, factor: float) -> Modes:
@@ -180,18 +171,14 @@ def _scaled_modes(modes: Modes, factor: float) -> Modes:
     return replace(modes, omega=modes.omega * factor, damping=modes.damping * factor)
 
 
-def _modulus_starts(reconstruction: Reconstruction, _: object) -> list[dict[str, float]]:
-    return [{"factor": f} for f in np.exp(np.linspace(-0.6, 0.6, 41)) if abs(f - 1) > 1e-3] + [
-        {"factor": f} for f in (0.995, 1.005)
-    ]
-
-
 MODULUS_ERROR = Kind(
     name="modulus_error",
     path="structure",
     parameters=lambda rig, _: (Parameter("factor", "", 0.2, 5.0, logarithmic=True, neutral=1.0),),
     apply=solved_once(_modulus),
-    starts=_modulus_starts,
+    starts=lambda reconstruction, _: [
+        {"factor": f} for f in (*np.exp(np.linspace(-0.6, 0.6, 41)), 0.995, 1.005) if abs(f - 1) > 1e-3
+    ],
     targets=lambda rig: (None,) if rig.modes.omega.any() else (),
     phrase="an overall stiffness error",
 )
@@ -222,21 +209,16 @@ def _point_starts(
 POINT_MASS = Kind(
     name="point_mass",
     path="structure",
-    parameters=lambda rig, _: (
-        *place_parameters(rig),
-        positive("mass", "kg", Scales.of(rig).mass, 1e-8, 1e5, neutral=0.0),
-    ),
+    parameters=at_a_place(lambda scales: positive("mass", "kg", scales.mass, 1e-8, 1e5, neutral=0.0)),
     apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointMass(place_of(v), v["mass"]))),
     starts=_point_starts("mass", "acceleration", "mass", between=False),
     phrase="an added mass",
 )
 
 
-def _spring_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
-    size = Scales.of(rig).stiffness
-    bounds = -1e5 * size, 1e5 * size
-    stiffness = Parameter("stiffness", "N/m", *bounds, logarithmic=True, scale=1e-8 * size, neutral=0.0)
-    return (*place_parameters(rig), stiffness)
+def _spring_stiffness(scales: Scales) -> Parameter:
+    bounds = -1e5 * scales.stiffness, 1e5 * scales.stiffness
+    return Parameter("stiffness", "N/m", *bounds, logarithmic=True, scale=1e-8 * scales.stiffness, neutral=0.0)
 
 
 def _as_rotational_spring(spring: Effect, rig: Rig) -> tuple[Effect, ...]:
@@ -253,7 +235,7 @@ def _as_rotational_spring(spring: Effect, rig: Rig) -> tuple[Effect, ...]:
 GROUND_SPRING = Kind(
     name="ground_spring",
     path="structure",
-    parameters=_spring_parameters,
+    parameters=at_a_place(_spring_stiffness),
     apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointSpring(place_of(v), v["stiffness"]))),
     starts=_point_starts("stiffness", "displacement", "stiffness", signed=True),
     phrase="a spring to ground",
@@ -265,10 +247,7 @@ GROUND_SPRING = Kind(
 POINT_DAMPER = Kind(
     name="point_damper",
     path="structure",
-    parameters=lambda rig, _: (
-        *place_parameters(rig),
-        positive("coefficient", "N s/m", Scales.of(rig).damping, 1e-8, 1e5, neutral=0.0),
-    ),
+    parameters=at_a_place(lambda scales: positive("coefficient", "N s/m", scales.damping, 1e-8, 1e5, neutral=0.0)),
     apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointDamper(place_of(v), v["coefficient"]))),
     starts=_point_starts("coefficient", "velocity", "damping"),
     phrase="a viscous damper to ground",
@@ -362,7 +341,7 @@ SUPPORT_ROTATION = Kind(
         {"rotational_stiffness": _end_stiffness(reconstruction.rig) * s} for s in np.geomspace(0.01, 3000.0, 16)
     ],
     targets=_ends,
-    phrase="a support that is neither hinged nor clamped",
+    phrase="a support of finite rotational stiffness",
     fixed_place=lambda support, rig: (
         0.0 if support.target == "left" else _beam(rig).length,
         f"at the {support.target} end",
@@ -388,6 +367,10 @@ def _with_tension(rig: Rig, _: object, values: dict[str, float]) -> Rig:
     return resolved(rig, replace(beam, tension=beam.tension + values["tension"]))
 
 
+# start values, of the buckling load
+LOADS = (-0.9, -0.6, -0.4, -0.25, -0.15, -0.08, -0.03, 0.03, 0.08, 0.15, 0.25, 0.4, 0.6, 1.0, 1.5, 2.5, 4.0)
+
+
 def _load_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
     load = buckling_load(rig)
     return (Parameter("tension", "N", -4.0 * load, 200.0 * load, scale=0.05 * load, neutral=0.0),)
@@ -398,11 +381,7 @@ AXIAL_LOAD = Kind(
     path="structure",
     parameters=_load_parameters,
     apply=solved_once(_with_tension),
-    starts=lambda reconstruction, _: [
-        {"tension": share * buckling_load(reconstruction.rig)}
-        for share in (-0.9, -0.6, -0.4, -0.25, -0.15, -0.08, -0.03)
-        + (0.03, 0.08, 0.15, 0.25, 0.4, 0.6, 1.0, 1.5, 2.5, 4.0)
-    ],
+    starts=lambda reconstruction, _: [{"tension": share * buckling_load(reconstruction.rig)} for share in LOADS],
     targets=lambda rig: (None,) if isinstance(rig.structure, Beam) else (),
     phrase="an axial load",
 )
@@ -473,12 +452,13 @@ MODAL_DAMPING = Kind(
 
 # --- stiffness_drift
 
-DRIFTS = (0.02, 0.05, 0.08, 0.12, 0.18, 0.27, 0.4, 0.6)  # relative, over a record: start values of either sign
+# relative, over a record: start values of either sign
+DRIFTS = np.array([0.02, 0.05, 0.08, 0.12, 0.18, 0.27, 0.4, 0.6])
 
 
 def _drift_starts(reconstruction: Reconstruction, _: object) -> list[dict[str, float]]:
     longest = max(record.n_samples * record.sample_time for record in reconstruction.data.records)
-    return [{"rate": share / longest} for share in (*(-share for share in DRIFTS[::-1]), *DRIFTS)]
+    return [{"rate": float(share / longest)} for share in (*-DRIFTS[::-1], *DRIFTS)]
 
 
 STIFFNESS_DRIFT = Kind(
@@ -489,7 +469,7 @@ STIFFNESS_DRIFT = Kind(
     ),
     apply=lambda rig, _, v: replace(rig, stiffness_rate=v["rate"]),
     starts=_drift_starts,
-    phrase="a stiffness that drifts in time",
+    phrase="a stiffness drift",
 )
 
 KINDS = (

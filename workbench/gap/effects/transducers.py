@@ -1,23 +1,26 @@
 """Kinds of effects of actuators and sensors."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import combinations, permutations
 from typing import Any
 
 import numpy as np
 
+from workbench.arrays import Floats
 from workbench.gap.effects.effect import (
     ALL,
     Effect,
     Kind,
     Parameter,
+    Parameters,
     Reconstruction,
     Scales,
+    Starts,
     place_of,
     place_parameters,
     place_values,
+    positive,
 )
 from workbench.records.record import QUANTITIES
 from workbench.rig.actuators import linear_actuator
@@ -26,17 +29,17 @@ from workbench.rig.sensors import linear_sensor
 from workbench.rig.simulate import simulate_record
 from workbench.structure.domain import Interval, Location, NamedPoints, centred_at, reach
 
-SENSOR_UNIT = "unit of the sensor"
 # of a residual's mean square: cross-talk is tried where another channel explains more of it
 LEAST_CROSSTALK = 0.05
 # of a command's mean square: cross-talk from another that differs by less from a multiple of it is a gain
 LEAST_OWN = 0.01
-Starts = Callable[[Reconstruction, Any], Iterable[dict[str, Any]]]
-
 SLOW_ENTRY = 0.1  # of the rms step between samples: a reading that reaches its top in a larger step is cut off there
 # stay at the top, in units of the time to stop at the deceleration before it: three times as long as up and back
 LONG_STAY = 6.0
 TURNING_SAMPLES = 2  # longest stay of a motion that reverses slowly
+
+Apply = Callable[[Rig, Any, dict[str, Any]], Rig]
+Targets = Callable[[Rig], tuple[str, ...]]
 
 # --- targets and changes
 
@@ -54,16 +57,14 @@ def each_sensor(rig: Rig) -> tuple[str, ...]:
     return tuple(s.name for s in rig.sensors)
 
 
-def or_all(each: Callable[[Rig], tuple[str, ...]]) -> Callable[[Rig], tuple[str, ...]]:
+def or_all(each: Targets) -> Targets:
     """Every target alone, and all of them together if there are several."""
     return lambda rig: (ALL, *each(rig)) if len(each(rig)) > 1 else each(rig)
 
 
 def _change_actuators(rig: Rig, target: str, **changes: Any) -> Rig:
-    changed = tuple(
-        replace(a, **changes) if (a.name == target or (target == ALL and not a.direct)) else a for a in rig.actuators
-    )
-    return replace(rig, actuators=changed)
+    names = each_actuator(rig) if target == ALL else (target,)
+    return replace(rig, actuators=tuple(replace(a, **changes) if a.name in names else a for a in rig.actuators))
 
 
 def _change_sensors(rig: Rig, target: str, **changes: Any) -> Rig:
@@ -99,8 +100,8 @@ def exchanged_last(effects: Sequence[Effect]) -> tuple[Effect, ...]:
     """
     ordered = list(effects)
     for exchange in [e for e in effects if e.kind in (SWAPPED_INPUTS, SWAPPED_OUTPUTS)]:
-        at, (one, other) = ordered.index(exchange), exchange.target
-        names = {one: other, other: one}
+        at = ordered.index(exchange)
+        names = dict(zip(exchange.target, exchange.target[::-1], strict=True))
         later = [e for e in ordered[at + 1 :] if e.kind.path == exchange.kind.path and not e.kind.applied_first]
         if any(isinstance(e.target, tuple) for e in later):  # such an effect may involve both channels, so it stays
             continue
@@ -144,184 +145,121 @@ def _in_samples(name: str, *times: float) -> Starts:
     return lambda reconstruction, _: [{name: n * reconstruction.data.records[0].sample_time} for n in times]
 
 
-def _time_scale(rig: Rig) -> float:
-    return Scales.of(rig).time
+def _set(side: str, parameter: str, attribute: str | None = None) -> Apply:
+    """Sets an attribute of actuators or sensors, of the name of the parameter unless given, to that parameter."""
+    change = _change_actuators if side == "actuators" else _change_sensors
+    return lambda rig, target, v: change(rig, target, **{attribute or parameter: v[parameter]})
 
 
-def _force_scale(rig: Rig) -> float:
-    return Scales.of(rig).force
+def _time(name: str, low: float) -> Parameters:
+    """A time, s, of at least `low` times the time scale of the rig."""
+    return lambda rig, _: (positive(name, "s", Scales.of(rig).time, low, 1e4, neutral=0.0),)
 
 
-def _one_parameter_kind(
-    path: str,
-    name: str,
-    field: str,
-    unit: str,
-    phrase: str,
-    *,
-    starts: Starts,
-    targets: Callable[[Rig], tuple[str, ...]],
-    low: float = -1e12,
-    high: float = 1e12,
-    log: bool = False,
-    attribute: str | None = None,
-    neutral: float | None = None,
-    size: Callable[[Rig], float] = lambda rig: 1.0,
-    apply: Callable[[Rig, Any, dict[str, Any]], Rig] | None = None,
-    **options: Any,
-) -> Kind:
-    """A kind with one parameter, which sets an attribute of an actuator or a sensor.
+def _force(name: str, neutral: float | None = None) -> Parameters:
+    """The magnitude of a force, N."""
+    return lambda rig, _: (positive(name, "N", Scales.of(rig).force, neutral=neutral),)
 
-    Args:
-        path: "actuator" or "sensor".
-        name: of the kind.
-        field: name of the parameter.
-        unit: of the parameter.
-        phrase: name of the kind in a sentence.
-        starts: start values for a search.
-        targets: actuators or sensors that it applies to.
-        low, high: bounds, in units of `size`.
-        log: whether the parameter is fitted on a logarithmic scale.
-        attribute: that it sets; None for the one named `field`.
-        neutral: value at which it changes nothing.
-        size: scale of the bounds, from the rig.
-        apply: used instead of setting the attribute.
-        options: further fields of `Kind`.
-    """
-    attribute = attribute or field
-    change = _change_actuators if path == "actuator" else _change_sensors
+
+def _reading(name: str, *, is_positive: bool = False) -> Parameters:
+    """A parameter in the unit of the target's readings, dimensionless if these are of several quantities."""
 
     def parameters(rig: Rig, target: str) -> tuple[Parameter, ...]:
-        shown, scale = unit, 0.1
-        if unit == SENSOR_UNIT:
-            sensors = [s for s in rig.sensors if target in (s.name, "all")]
-            is_one_quantity = len({s.quantity for s in sensors}) == 1
-            shown = QUANTITIES.get(sensors[0].quantity, "") if is_one_quantity else ""
-            scale = max(sensors[0].noise_std, 1e-300)
-        bounds = low * size(rig), high * size(rig)
-        return (Parameter(field, shown, *bounds, logarithmic=log, scale=scale, neutral=neutral),)
+        sensors = [s for s in rig.sensors if target in (s.name, ALL)]
+        unit = QUANTITIES.get(sensors[0].quantity, "") if len({s.quantity for s in sensors}) == 1 else ""
+        if is_positive:
+            return (Parameter(name, unit, 1e-300, 1e12, logarithmic=True),)
+        return (Parameter(name, unit, -1e12, 1e12, scale=max(sensors[0].noise_std, 1e-300)),)
 
-    return Kind(
-        name=name,
-        path=path,
-        parameters=parameters,
-        apply=apply or (lambda rig, target, v: change(rig, target, **{attribute: v[field]})),
-        starts=starts,
-        targets=targets,
-        phrase=phrase,
-        **options,
-    )
+    return parameters
 
 
-_actuator = partial(_one_parameter_kind, "actuator", log=True)
-_sensor = partial(_one_parameter_kind, "sensor", targets=each_sensor)
-
-ACTUATOR_GAIN = _actuator(
-    "actuator_gain",
-    "gain",
-    "",
-    "a wrong actuator gain",
-    neutral=1.0,
-    targets=each_actuator,
+ACTUATOR_GAIN = Kind(
+    name="actuator_gain",
+    path="actuator",
+    parameters=lambda rig, _: (Parameter("gain", "", -20.0, 20.0, scale=0.1, neutral=1.0),),
     apply=lambda rig, target, v: _with_gain(rig, "actuators", target, v["gain"]),
-    low=-20.0,
-    high=20.0,
-    log=False,
     starts=lambda reconstruction, _: [{"gain": 0.9}],
+    targets=each_actuator,
     signed=True,
+    phrase="an actuator gain error",
 )
 
-ACTUATOR_LAG = _actuator(
-    "actuator_lag",
-    "time_constant",
-    "s",
-    "a lag of the actuators",
-    neutral=0.0,
-    targets=or_all(each_actuator),
-    low=1e-6,
-    high=1e4,
-    size=_time_scale,
+ACTUATOR_LAG = Kind(
+    name="actuator_lag",
+    path="actuator",
+    parameters=_time("time_constant", 1e-6),
+    apply=_set("actuators", "time_constant"),
     starts=_in_samples("time_constant", 0.1, 0.4, 1.2, 4.0, 12.0),
+    targets=or_all(each_actuator),
+    phrase="a lag of the actuators",
 )
 
-ACTUATOR_DELAY = _actuator(
-    "actuator_delay",
-    "delay",
-    "s",
-    "a delay of the actuators",
-    neutral=0.0,
-    targets=or_all(each_actuator),
-    low=1e-9,
-    high=1e4,
-    size=_time_scale,
+ACTUATOR_DELAY = Kind(
+    name="actuator_delay",
+    path="actuator",
+    parameters=_time("delay", 1e-9),
+    apply=_set("actuators", "delay"),
     starts=_in_samples("delay", 0.1, 0.4, 0.8, 1.3, 1.8, 2.5, 3.5, 5.0, 8.0, 12.0),
+    targets=or_all(each_actuator),
+    phrase="a delay of the actuators",
 )
 
-ACTUATOR_SATURATION = _actuator(
-    "actuator_saturation",
-    "limit",
-    "N",
-    "saturation of the actuators",
-    targets=or_all(each_actuator),
-    low=1e-12,
-    high=1e12,
-    size=_force_scale,
-    nonlinear=True,
+ACTUATOR_SATURATION = Kind(
+    name="actuator_saturation",
+    path="actuator",
+    parameters=_force("limit"),
+    apply=_set("actuators", "limit"),
     starts=_quantiles("limit", 0.5, 0.65, 0.8, 0.9, 0.96, 0.99),
+    targets=or_all(each_actuator),
+    nonlinear=True,
+    phrase="saturation of the actuators",
 )
 
-ACTUATOR_DEAD_ZONE = _actuator(
-    "actuator_dead_zone",
-    "width",
-    "N",
-    "a dead zone of the actuators",
-    attribute="dead_zone",
-    neutral=0.0,
-    targets=or_all(each_actuator),
-    low=1e-12,
-    high=1e12,
-    size=_force_scale,
-    nonlinear=True,
+ACTUATOR_DEAD_ZONE = Kind(
+    name="actuator_dead_zone",
+    path="actuator",
+    parameters=_force("width", neutral=0.0),
+    apply=_set("actuators", "width", "dead_zone"),
     starts=_quantiles("width", 0.03, 0.08, 0.15, 0.3, 0.5, 0.7),
+    targets=or_all(each_actuator),
+    nonlinear=True,
+    phrase="a dead zone of the actuators",
 )
+
+
+def _bias_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
+    force = Scales.of(rig).force
+    return (Parameter("force", "N", -1e6 * force, 1e6 * force, scale=1e-3 * force, neutral=0.0),)
 
 
 ACTUATOR_BIAS = Kind(
     name="actuator_bias",
     path="actuator",
-    parameters=lambda rig, _: (
-        Parameter(
-            "force", "N", -1e6 * _force_scale(rig), 1e6 * _force_scale(rig), scale=1e-3 * _force_scale(rig), neutral=0.0
-        ),
-    ),
-    apply=lambda rig, target, v: _change_actuators(rig, target, bias=v["force"]),
-    starts=lambda reconstruction, target: [
-        {"force": 0.1 * float(np.sqrt(np.mean(_commands(reconstruction, target) ** 2)))}
-    ],
+    parameters=_bias_parameters,
+    apply=_set("actuators", "force", "bias"),
+    starts=lambda force, target: [{"force": 0.1 * float(np.sqrt(np.mean(_commands(force, target) ** 2)))}],
     targets=each_actuator,
     signed=True,
     phrase="a constant force of an actuator",
 )
 
 
-ACTUATOR_RATE_LIMIT = _actuator(
-    "actuator_rate_limit",
-    "rate",
-    "N/s",
-    "a rate limit of the actuators",
-    attribute="rate_limit",
-    targets=or_all(each_actuator),
-    low=1e-300,
-    high=1e300,
-    nonlinear=True,
+ACTUATOR_RATE_LIMIT = Kind(
+    name="actuator_rate_limit",
+    path="actuator",
+    parameters=lambda rig, _: (Parameter("rate", "N/s", 1e-300, 1e300, logarithmic=True),),
+    apply=_set("actuators", "rate", "rate_limit"),
     starts=_quantiles("rate", 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, of_rates=True),
+    targets=or_all(each_actuator),
+    nonlinear=True,
+    phrase="a rate limit of the actuators",
 )
 
 
-def _hysteresis_starts(reconstruction: Reconstruction, target: str) -> Iterator[dict[str, float]]:
-    for width in np.quantile(_commands(reconstruction, target), (0.2, 0.5, 0.8)):
-        for share in (0.1, 0.4):
-            yield {"share": share, "width": float(width)}
+def _hysteresis_starts(reconstruction: Reconstruction, target: str) -> list[dict[str, float]]:
+    widths = np.quantile(_commands(reconstruction, target), (0.2, 0.5, 0.8))
+    return [{"share": share, "width": float(width)} for width in widths for share in (0.1, 0.4)]
 
 
 ACTUATOR_HYSTERESIS = Kind(
@@ -331,9 +269,7 @@ ACTUATOR_HYSTERESIS = Kind(
         Parameter("share", "", 1e-4, 1.0, scale=0.1, neutral=0.0),
         Parameter("width", "N", 1e-300, 1e300, logarithmic=True),
     ),
-    apply=lambda rig, target, v: _change_actuators(
-        rig, target, hysteresis_share=v["share"], hysteresis_width=v["width"]
-    ),
+    apply=lambda rig, name, v: _change_actuators(rig, name, hysteresis_share=v["share"], hysteresis_width=v["width"]),
     starts=_hysteresis_starts,
     targets=or_all(each_actuator),
     nonlinear=True,
@@ -355,10 +291,7 @@ SWAPPED_INPUTS = Kind(
 
 
 def _responses_to_share(reconstruction: Reconstruction, pair: tuple[str, str]) -> list[np.ndarray]:
-    """Readings (n_sensors, n_samples) of each record per share of the second input's command in the first.
-
-    Laws at points and limits of the channels are left out.
-    """
+    """Linear response (n_sensors, n_samples) of each record per share of the second input's command in the first."""
     found = []
     for record, residual in zip(reconstruction.data.records, reconstruction.residuals, strict=True):
         rig = reconstruction.rig.in_record(record.name)
@@ -387,23 +320,15 @@ def _actuator_crosstalk_starts(reconstruction: Reconstruction, pair: tuple[str, 
     alike = float(own @ source) ** 2 > (1.0 - LEAST_OWN) * size * float(source @ source)
     if not source.any() or (size > 0 and alike):
         return []
-    noise = np.array(list(_noise(reconstruction.rig).values()))[:, None]
+    noise = np.array([*_noise(reconstruction.rig).values()])[:, None]
     change = np.concatenate([(y / noise).ravel() for y in _responses_to_share(reconstruction, pair)])
-    residual = np.concatenate([(y / noise).ravel() for y in reconstruction.residuals])
-    power = float(change @ change)
-    share = float(residual @ change) / power if power > 0 else 0.0
-    return [{"share": share}] if share**2 * power > LEAST_CROSSTALK * float(residual @ residual) else []
+    return _share_start(np.concatenate([(y / noise).ravel() for y in reconstruction.residuals]), change)
 
 
 def _with_share(rig: Rig, pair: tuple[str, str], share: float) -> Rig:
     """The rig with a share of the second input's command added to that of the first."""
-    name, source = pair
-    return replace(
-        rig,
-        actuators=tuple(
-            replace(a, crosstalk=(*a.crosstalk, (source, share))) if a.name == name else a for a in rig.actuators
-        ),
-    )
+    taken = next(a.crosstalk for a in rig.actuators if a.name == pair[0])
+    return _change_actuators(rig, pair[0], crosstalk=(*taken, (pair[1], share)))
 
 
 ACTUATOR_CROSSTALK = Kind(
@@ -427,7 +352,7 @@ def _position_starts(reconstruction: Reconstruction, _: object) -> list[dict[str
     return [place_values(where) for where in domain.grid(9)]
 
 
-def _movable(targets: Callable[[Rig], tuple[str, ...]]) -> Callable[[Rig], tuple[str, ...]]:
+def _movable(targets: Targets) -> Targets:
     """Targets that may be misplaced: none if the mode shapes are known at the inputs and outputs only."""
 
     def movable(rig: Rig) -> tuple[str, ...]:
@@ -439,7 +364,6 @@ def _movable(targets: Callable[[Rig], tuple[str, ...]]) -> Callable[[Rig], tuple
 
 
 def _nominal_place(rig: Rig, target: str) -> Location:
-    """Place of an actuator in the nominal rig."""
     return next(a.at for a in rig.actuators if a.name == target)
 
 
@@ -484,17 +408,15 @@ SENSOR_MISPLACEMENT = Kind(
 # --- sensors
 
 
-SENSOR_GAIN = _sensor(
-    "sensor_gain",
-    "gain",
-    "",
-    "a wrong sensor gain",
-    starts=lambda reconstruction, _: [{"gain": 0.9}],
+SENSOR_GAIN = Kind(
+    name="sensor_gain",
+    path="sensor",
+    parameters=lambda rig, _: (Parameter("gain", "", -100.0, 100.0, scale=0.1, neutral=1.0),),
     apply=lambda rig, target, v: _with_gain(rig, "sensors", target, v["gain"]),
-    low=-100.0,
-    high=100.0,
+    starts=lambda reconstruction, _: [{"gain": 0.9}],
+    targets=each_sensor,
     signed=True,
-    neutral=1.0,
+    phrase="a sensor gain error",
 )
 
 
@@ -504,53 +426,46 @@ def _residual(reconstruction: Reconstruction, name: str) -> np.ndarray:
     return np.concatenate([residual[j] for residual in reconstruction.residuals])
 
 
-SENSOR_BIAS = _sensor(
-    "sensor_bias",
-    "bias",
-    SENSOR_UNIT,
-    "a sensor bias",
+SENSOR_BIAS = Kind(
+    name="sensor_bias",
+    path="sensor",
+    parameters=_reading("bias"),
+    apply=_set("sensors", "bias"),
     starts=lambda reconstruction, target: [{"bias": float(np.mean(_residual(reconstruction, target)))}],
+    targets=each_sensor,
     signed=True,
+    phrase="a sensor bias",
 )
 
-SENSOR_DRIFT = _sensor(
-    "sensor_drift",
-    "drift_over_record",
-    SENSOR_UNIT,
-    "a sensor drift",
-    starts=lambda reconstruction, target: [
-        {"drift_over_record": 2.0 * float(np.mean(_residual(reconstruction, target)))}
-    ],
-    attribute="drift",
+SENSOR_DRIFT = Kind(
+    name="sensor_drift",
+    path="sensor",
+    parameters=_reading("drift_over_record"),
+    apply=_set("sensors", "drift_over_record", "drift"),
+    starts=lambda force, target: [{"drift_over_record": 2.0 * float(np.mean(_residual(force, target)))}],
+    targets=each_sensor,
     signed=True,
+    phrase="a sensor drift",
 )
 
-SENSOR_LAG = _sensor(
-    "sensor_lag",
-    "time_constant",
-    "s",
-    "a lag of the sensors",
+SENSOR_LAG = Kind(
+    name="sensor_lag",
+    path="sensor",
+    parameters=_time("time_constant", 1e-6),
+    apply=_set("sensors", "time_constant"),
     starts=_in_samples("time_constant", 0.1, 0.4, 1.2, 4.0, 12.0),
-    log=True,
-    low=1e-6,
-    high=1e4,
-    size=_time_scale,
-    neutral=0.0,
     targets=or_all(each_sensor),
+    phrase="a lag of the sensors",
 )
 
-
-SENSOR_DELAY = _sensor(
-    "sensor_delay",
-    "delay",
-    "s",
-    "a delay of a sensor",
+SENSOR_DELAY = Kind(
+    name="sensor_delay",
+    path="sensor",
+    parameters=_time("delay", 1e-9),
+    apply=_set("sensors", "delay"),
     starts=_in_samples("delay", 0.1, 0.4, 0.8, 1.3, 2.5, 5.0),
-    log=True,
-    low=1e-9,
-    high=1e4,
-    size=_time_scale,
-    neutral=0.0,
+    targets=each_sensor,
+    phrase="a delay of a sensor",
 )
 
 
@@ -563,10 +478,14 @@ def _predicted(reconstruction: Reconstruction, name: str) -> np.ndarray:
 
 def _crosstalk_starts(reconstruction: Reconstruction, pair: tuple[str, str]) -> list[dict[str, float]]:
     """Share of the second sensor's prediction in the residual of the first, if that explains enough of it."""
-    residual, source = _residual(reconstruction, pair[0]), _predicted(reconstruction, pair[1])
-    size = float(source @ source)
-    share = float(residual @ source) / size if size > 0 else 0.0
-    return [{"share": share}] if share**2 * size > LEAST_CROSSTALK * float(residual @ residual) else []
+    return _share_start(_residual(reconstruction, pair[0]), _predicted(reconstruction, pair[1]))
+
+
+def _share_start(residual: Floats, response: Floats) -> list[dict[str, float]]:
+    """The least-squares share of a response in a residual, if it explains enough of it."""
+    power = float(response @ response)
+    share = float(residual @ response) / power if power > 0 else 0.0
+    return [{"share": share}] if share**2 * power > LEAST_CROSSTALK * float(residual @ residual) else []
 
 
 def _noise(rig: Rig) -> dict[str, float]:
@@ -599,9 +518,9 @@ def _swapped_output_starts(reconstruction: Reconstruction, pair: tuple[str, str]
     noise, own, crossed = _noise(reconstruction.rig), 0.0, 0.0
     for name, other in (pair, pair[::-1]):
         residual = _residual(reconstruction, name)
-        measured = _predicted(reconstruction, name) + residual
+        error = _predicted(reconstruction, name) + residual - _predicted(reconstruction, other)
         own += float(residual @ residual) / noise[name] ** 2
-        crossed += float(np.sum((measured - _predicted(reconstruction, other)) ** 2)) / noise[name] ** 2
+        crossed += float(np.sum(error**2)) / noise[name] ** 2
     return [{}] if crossed < own else []
 
 
@@ -626,14 +545,10 @@ def clipped_level(rows: list[np.ndarray]) -> float | None:
 
 
 def _comes_to_rest(rows: list[np.ndarray], at_top: list[np.ndarray]) -> bool:
-    """Whether readings come to rest, or reverse, at their top instead of being cut off there.
+    """Whether readings (n_samples,) come to rest, or reverse, where they are `at_top` instead of being cut off there.
 
     A motion that comes to rest slows down first, and stays longer than its deceleration would have taken it up and
     back. A motion that a controller repeats reverses at the same top and hardly stays there.
-
-    Args:
-        rows: readings (n_samples,) of each record.
-        at_top: (n_samples,) of each record, whether the reading is at its top.
     """
     entering, at_rest = [], []
     for row, flags in zip(rows, at_top, strict=True):
@@ -677,30 +592,29 @@ def _read(name: str, measure: Callable[[list[np.ndarray]], float | None]) -> Sta
     return starts
 
 
-SENSOR_CLIPPING = _sensor(
-    "sensor_clipping",
-    "limit",
-    SENSOR_UNIT,
-    "clipping of a sensor",
+SENSOR_CLIPPING = Kind(
+    name="sensor_clipping",
+    path="sensor",
+    parameters=_reading("limit", is_positive=True),
+    apply=_set("sensors", "limit"),
     starts=_read("limit", clipped_level),
-    log=True,
-    low=1e-300,
+    targets=each_sensor,
     nonlinear=True,
     found_in="readings",
+    phrase="clipping of a sensor",
 )
 
-
-SENSOR_QUANTISATION = _sensor(
-    "sensor_quantisation",
-    "step",
-    SENSOR_UNIT,
-    "rounding of a sensor",
+SENSOR_QUANTISATION = Kind(
+    name="sensor_quantisation",
+    path="sensor",
+    parameters=_reading("step", is_positive=True),
+    apply=_set("sensors", "step"),
     starts=_read("step", lambda rows: step_of(np.concatenate(rows))),
-    log=True,
-    low=1e-300,
+    targets=each_sensor,
     nonlinear=True,
     found_in="readings",
     unpredictable="Quantisation leaves an unpredictable error of step/√12 rms.",
+    phrase="quantisation of a sensor",
 )
 
 KINDS = (

@@ -116,13 +116,7 @@ def _is_clear(gaps: Floats, floors: Floats) -> Flags:
 
 
 def break_down(reconstruction: ForceReconstruction, effects: Sequence[Effect], place: ForceLocation) -> GapBreakdown:
-    """Break down the gap on the fit records.
-
-    Args:
-        reconstruction: of the nominal rig.
-        effects: that explain the gap, if known; they give the path.
-        place: of an unmodelled force, located without faulty sensors.
-    """
+    """Break down the gap of the nominal rig on the fit records; `effects` that explain it, if known, give the path."""
     rig, data = reconstruction.rig, reconstruction.data
     scales = [scale_of(record.outputs) for record in data.counted]
     scaled = [r / scale for r, scale in zip(reconstruction.residuals, scales, strict=True)]
@@ -166,7 +160,7 @@ def break_down(reconstruction: ForceReconstruction, effects: Sequence[Effect], p
 def _by_mode(frequencies: Floats, seen: Sequence[tuple[Floats, float, float]]) -> tuple[Floats, float]:
     """Share of the residuals' power in the band of each mode (n_modes,), and above that of the last.
 
-    Rigid modes share one band in equal parts; `seen` as of `_shares_between`.
+    Rigid modes share one band in equal parts; `seen`: as of `_shares_between`.
     """
     elastic = frequencies[frequencies > 0]
     first = BREAKDOWN.rigid * elastic[:1] * (elastic.size < frequencies.size)  # zero: an empty band
@@ -180,11 +174,9 @@ def _by_mode(frequencies: Floats, seen: Sequence[tuple[Floats, float, float]]) -
 
 
 def _shares_between(edges: np.ndarray, seen: Sequence[tuple[Floats, float, float]]) -> np.ndarray:
-    """Share of the residuals' power above the noise between each edge (Hz) and the next.
+    """Share of the residuals' power above the noise between each edge (n_bands + 1,), Hz, and the next.
 
-    Args:
-        edges: (n_bands + 1,).
-        seen: a record's scaled residual (n_outputs, n_samples), its sample time, and the power of its noise.
+    seen: a record's scaled residual (n_outputs, n_samples), its sample time, and the power of its noise.
     """
     power = np.zeros(edges.size - 1)
     for s, sample_time, floor in seen:
@@ -198,8 +190,8 @@ def _shares_between(edges: np.ndarray, seen: Sequence[tuple[Floats, float, float
 
 def _shares_of_eighths(scaled: Floats) -> Floats:
     """Share of the power in each eighth of a record (8,)."""
-    power: Floats = np.array([(piece**2).sum() for piece in np.array_split(scaled, 8, axis=1)])
-    return power / max(float(power.sum()), 1e-300)
+    power = np.array([(piece**2).sum() for piece in np.array_split(scaled, 8, axis=1)])
+    return np.asarray(power / max(float(power.sum()), 1e-300))
 
 
 def _path(
@@ -207,12 +199,8 @@ def _path(
 ) -> str:
     """Path of the first effect, or a guess from the sensors and inputs that show the gap.
 
-    Args:
-        reconstruction: of the nominal rig.
-        excess: (n_records, n_outputs) power above the noise, scaled.
-        floors: (n_records,) power of the noise, likewise, the mean over sensors.
-        power: (n_outputs,) above the noise in all records.
-        effects: that explain the gap, if known.
+    excess: (n_records, n_outputs) scaled power above the noise; floors: (n_records,) that of the noise, the mean over
+    sensors; power: (n_outputs,) above the noise in all records.
     """
     if effects:
         return effects[0].kind.path
@@ -287,10 +275,7 @@ def linear_share(rig: Rig, seen: Sequence[tuple[Record, Floats]], shares: Floats
     validation, resonators would fit any narrow-band residual, which has few degrees of freedom. A single record is
     halved.
 
-    Args:
-        rig: nominal.
-        seen: records with their residuals (n_outputs, n_samples), measured minus predicted.
-        shares: (n_modes,) of the gap around each mode; only the modes with the largest shares are used.
+    shares: (n_modes,) of the gap around each mode; only the modes with the largest shares are used.
     """
     chosen = [int(r) for r in np.argsort(-shares)[: BREAKDOWN.most_modes] if shares[r] > 0]
     sizes = np.sqrt(np.mean([record.outputs.var(axis=1) for record, _ in seen], axis=0))[:, None]

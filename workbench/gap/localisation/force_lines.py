@@ -73,7 +73,6 @@ class CoupledReceptances:
         return real_product(weighted, tail), real_product(weighted, left)
 
     def on(self, kept: np.ndarray) -> "CoupledReceptances":
-        """The receptances at some of the lines."""
         return CoupledReceptances(self.compliance[kept], self.tail[kept])
 
 
@@ -98,6 +97,8 @@ class _SensorGroup:
 class UncoupledReceptances:
     """Receptances of modes that damping does not couple: products of mode shapes and modal receptances.
 
+    Its methods are those of `CoupledReceptances`.
+
     Attributes:
         compliance: (n_lines, n_modes) modal receptances.
         sensors: grouped by the derivative that they measure.
@@ -107,7 +108,6 @@ class UncoupledReceptances:
     sensors: tuple[_SensorGroup, ...]
 
     def to_force(self, shape: Floats) -> Complexes:
-        """See `CoupledReceptances`."""
         moved = self.compliance * shape
         readings = np.empty((len(moved), sum(group.here.size for group in self.sensors)), complex)
         for group in self.sensors:
@@ -115,14 +115,12 @@ class UncoupledReceptances:
         return readings
 
     def along(self, directions: Complexes) -> Complexes:
-        """See `CoupledReceptances`."""
         seen: list[Complexes] = [
             np.tile(directions[:, group.here] @ group.shapes, 2) * group.tail for group in self.sensors
         ]
         return sum(seen[1:], start=seen[0])
 
     def products(self, left: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See `CoupledReceptances`."""
         size = 2 * self.compliance.shape[1]
         own, along = np.zeros((size, size)), np.zeros(size)
         for group in self.sensors:
@@ -133,7 +131,6 @@ class UncoupledReceptances:
         return own, along
 
     def on(self, kept: np.ndarray) -> "UncoupledReceptances":
-        """See `CoupledReceptances`."""
         sensors = (replace(group, rates=group.rates[kept], tail=group.tail[kept]) for group in self.sensors)
         return UncoupledReceptances(self.compliance[kept], tuple(sensors))
 
@@ -143,23 +140,14 @@ Receptances = UncoupledReceptances | CoupledReceptances
 
 def real_product(one: Complexes, other: Complexes) -> Floats:
     """Sum over lines of positive and negative frequency: 2 Re(oneᴴ other)."""
-    product: Floats = 2.0 * (one.real.T @ other.real + one.imag.T @ other.imag)
-    return product
+    return np.asarray(2.0 * (one.real.T @ other.real + one.imag.T @ other.imag))
 
 
 def receptances_of(rig: Rig, model: SampledModel, omega: Floats, n_samples: int, sample_time: float) -> Receptances:
-    """The receptances of a rig at spectral lines of a record.
-
-    Args:
-        rig: with the modes.
-        model: its sampled form, with the variance of each sensor's noise.
-        omega: (n_lines,) rad/s.
-        n_samples: of the record.
-        sample_time: s.
-    """
-    z = (1.0 + abs(UNDAMPED)) * np.exp(1j * omega * sample_time)
-    turn = _uncoupled if rig.modes.proportional else _coupled
-    return turn(rig, model, np.asarray(1j * omega, complex), z, np.sqrt(model.noise_variance), 1.0 / np.sqrt(n_samples))
+    """The receptances of a rig, and of its sampled form, at spectral lines (n_lines,), rad/s, of a record."""
+    z, rate = (1.0 + abs(UNDAMPED)) * np.exp(1j * omega * sample_time), np.asarray(1j * omega, complex)
+    of_modes = _uncoupled if rig.modes.proportional else _coupled
+    return of_modes(rig, model, rate, z, np.sqrt(model.noise_variance), 1.0 / np.sqrt(n_samples))
 
 
 def _coupled(
@@ -245,12 +233,10 @@ class Lines:
         return self._on(kept, weights[kept])
 
     def strongest(self, most: int) -> "Lines":
-        """At most `most` lines, those of the highest power."""
         strong = np.argsort(-self.weights * np.sum(np.abs(self.left) ** 2, axis=1))[:most]
         return self._on(strong, self.weights[strong])
 
     def _on(self, kept: np.ndarray, weights: np.ndarray) -> "Lines":
-        """Some of the lines, with their weights."""
         folded = tuple(each.on(kept) for each in self.folded)
         return Lines(self.receptances.on(kept), self.left[kept], weights, folded)
 
@@ -282,9 +268,7 @@ class Lines:
     def _transient(self, u: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Least-squares state d of the transient given a force, and the right-hand side of its normal equations.
 
-        Args:
-            u: T projected on the directions of the force.
-            a: the residual, likewise.
+        u, a: T and the residual, projected on the directions of the force.
         """
         own, along = self._products
         along = along - real_product(u, a)
@@ -332,14 +316,7 @@ def _moving_sum(values: np.ndarray) -> np.ndarray:
 
 
 def lines_of(rig: Rig, model: SampledModel, residuals: Sequence[np.ndarray], sample_time: float) -> list[Lines]:
-    """The spectral lines of every record's residual.
-
-    Args:
-        rig: nominal.
-        model: its sampled form, with the variance of each sensor's noise.
-        residuals: (n_sensors, n_samples) a record, in the sensors' units.
-        sample_time: s.
-    """
+    """The spectral lines of every record's residual (n_sensors, n_samples), in the sensors' units."""
     noise = np.sqrt(model.noise_variance)
     made: dict[int, tuple[np.ndarray, list[Receptances]]] = {}
     lines = []

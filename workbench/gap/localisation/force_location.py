@@ -10,7 +10,7 @@ from scipy.optimize import minimize, minimize_scalar
 
 from workbench.arrays import Floats
 from workbench.gap.localisation.force_lines import Lines
-from workbench.gap.localisation.force_reconstruction import ForceReconstruction, minima
+from workbench.gap.localisation.force_reconstruction import RECONSTRUCTION, ForceReconstruction, minima
 from workbench.renamed import Renamed
 from workbench.structure.domain import Between, Interval, NamedPoints, Rectangle
 from workbench.threads import one_blas_thread
@@ -22,7 +22,6 @@ class LocalisationSettings:
 
     valleys: int = 3  # local minima of the misfit that are refined
     rounds: int = 3  # alternations between the place and the weights of the lines
-    beside: float = 0.95  # of the grid spacing: range about a minimum in which it is refined
     resolved: float = 1e-3  # of the grid spacing: tolerance of the refinement
     pairs_shown: int = 12  # of named points
     two_sigma: float = 4.0  # rise of the misfit at two standard errors
@@ -71,9 +70,7 @@ def locate_force(reconstruction: ForceReconstruction) -> ForceLocation:
 
     One sensor locates nothing, since a force anywhere explains its readings. Sensors with a lag are left out.
     """
-    reconstruction = reconstruction.without(
-        [sensor.name for sensor in reconstruction.rig.sensors if sensor.time_constant > 0]
-    )
+    reconstruction = reconstruction.without([s.name for s in reconstruction.rig.sensors if s.time_constant > 0])
     domain, places = reconstruction.domain, reconstruction.places
     at: Any = reconstruction.peaks[0]
     if len(reconstruction.rig.sensors) < 2:
@@ -92,29 +89,23 @@ def locate_force(reconstruction: ForceReconstruction) -> ForceLocation:
         informative = reconstruction.informative(at)
         profile = reconstruction.screened(places, informative)
     else:
-        ranked = [
-            places[i] for i in np.argsort(-reconstruction.profile, kind="stable") if isinstance(places[i], Between)
-        ]
-        points = [where for where in places if not isinstance(where, Between)]
-        places = [*points, *ranked[: LOCALISATION.pairs_shown]]
+        ranked = [places[i] for i in np.argsort(-reconstruction.profile, kind="stable")]
+        pairs = [where for where in ranked if isinstance(where, Between)][: LOCALISATION.pairs_shown]
+        places = [*(where for where in places if not isinstance(where, Between)), *pairs]
         profile = reconstruction.misfits(places, informative)
         at, std = places[int(np.argmin(profile))], 0.0
     lowest = min(reconstruction.misfit(at, informative), profile.min())
     degrees_of_freedom = sum(each.degrees_of_freedom for each in reconstruction.lines)
     left = reconstruction.misfit(at) / max(degrees_of_freedom, 1) - 1.0
     std *= np.sqrt(max(left, 0.0) + 1.0)
-    return ForceLocation(
-        places, -0.5 * (profile - lowest), at, std, *_explained(reconstruction, degrees_of_freedom, left)
-    )
+    explained = _explained(reconstruction, degrees_of_freedom, left)
+    return ForceLocation(places, -0.5 * (profile - lowest), at, std, *explained)
 
 
 def _explained(reconstruction: ForceReconstruction, degrees_of_freedom: int, left: float) -> tuple[float, bool | None]:
     """Share of the gap's power that one force explains, and whether that is all of it; None if it cannot be tested.
 
-    Args:
-        reconstruction: of the nominal rig.
-        degrees_of_freedom: of the residual given the force.
-        left: its power above the noise, in units of the noise power.
+    left: power of the residual given the force, above the noise, in units of the noise power.
     """
     values = 2 * sum(each.left.size for each in reconstruction.lines)
     gap = sum(each.power for each in reconstruction.lines) - values
@@ -156,15 +147,11 @@ def _refined(reconstruction: ForceReconstruction, top: float) -> float:
     """The local minimum of the misfit along an interval."""
     at, informative = float(top), reconstruction.informative(top)
     length, spacing = reconstruction.domain.size, reconstruction.places[1] - reconstruction.places[0]
-    edge, beside = LOCALISATION.edge * length, LOCALISATION.beside * spacing
+    edge, beside = LOCALISATION.edge * length, RECONSTRUCTION.beside * spacing
     for _ in range(LOCALISATION.rounds):
-        found = minimize_scalar(
-            reconstruction.misfit,
-            bounds=(max(at - beside, edge), min(at + beside, length - edge)),
-            args=(informative,),
-            method="bounded",
-            options={"xatol": LOCALISATION.resolved * spacing},
-        )
+        how: Any = {"method": "bounded", "bounds": (max(at - beside, edge), min(at + beside, length - edge))}
+        tolerance = {"xatol": LOCALISATION.resolved * spacing}
+        found = minimize_scalar(reconstruction.misfit, args=(informative,), options=tolerance, **how)
         moved, at = abs(found.x - at), float(found.x)
         informative = reconstruction.informative(at)
         if moved < LOCALISATION.resolved * spacing:

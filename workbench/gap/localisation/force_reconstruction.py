@@ -15,10 +15,10 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import (
     ForceFilter,
     SampledModel,
+    gauss_markov_force_filter,
     log_likelihood,
     sampled_model,
     smoothed_states,
-    wandering_force_filter,
 )
 from workbench.gap.prediction.workers import ALONE, Workers
 from workbench.rig.motion import Motion
@@ -35,7 +35,7 @@ class ReconstructionSettings:
     most_peaks: int = 3  # of the likelihood that are kept
     one_rate: float = 1e-6  # relative difference of the sample times of two records that are taken for one
     places: int = 40  # of the grid along an interval
-    beside: float = 0.95  # of the grid spacing: range about a peak in which it is refined
+    beside: float = 0.95  # of the grid spacing: range about a peak, or a minimum, in which it is refined
     resolved: float = 2e-3  # of the grid spacing: tolerance of the refinement
     still: float = 1e-6  # of the largest mode shape: a point, or a pair of points, that no force moves
     broad: float = 0.1  # of a rectangle's diagonal: least distance between peaks
@@ -114,7 +114,6 @@ class ForceReconstruction:
 
     @property
     def domain(self) -> Domain:
-        """Of places on the structure."""
         return self.rig.modes.domain
 
     @cached_property
@@ -127,7 +126,6 @@ class ForceReconstruction:
 
     @property
     def has_several_rates(self) -> bool:
-        """Whether the records differ in sample rate."""
         return len(set(self.sample_times)) > 1
 
     @cached_property
@@ -144,14 +142,12 @@ class ForceReconstruction:
     def filters_at(self, where: Location, size: tuple[float, float]) -> dict[float, ForceFilter]:
         """The filter for an unknown force at a place, by sample time.
 
-        Args:
-            where: the place.
-            size: rms of the force, N, and its correlation time, in samples of the first record.
+        size: rms of the force, N, and its correlation time, in samples of the first record.
         """
         modes, (rms, memory) = self.rig.modes, size
         time, shape = memory * self.sample_times[0], modes.phi_at(where)
         each = self.models.items()
-        return {dt: wandering_force_filter(modes, model, shape, rms, time, dt) for dt, model in each}
+        return {dt: gauss_markov_force_filter(modes, model, shape, rms, time, dt) for dt, model in each}
 
     def _log_likelihood(self, where: Location, size: tuple[float, float], n_records: int | None = None) -> float:
         """Log-likelihood of an unknown force at a place, of a size as of `filters_at`, in the first or all records."""
@@ -167,9 +163,8 @@ class ForceReconstruction:
         if isinstance(self.domain, NamedPoints):
             places: tuple[Any, ...] = (*self.domain.grid(), *self.domain.pairs())
             moved = [float(np.abs(self.rig.modes.phi_at(where)).max()) for where in places]
-            return tuple(
-                where for where, size in zip(places, moved, strict=True) if size > RECONSTRUCTION.still * max(moved)
-            )
+            least = RECONSTRUCTION.still * max(moved)
+            return tuple(where for where, size in zip(places, moved, strict=True) if size > least)
         return self.domain.grid(self._along)
 
     @cached_property
@@ -187,29 +182,20 @@ class ForceReconstruction:
         """Rms, N, and correlation time, in samples, of the unmodelled force: the likeliest of a coarse grid."""
         if self.given_size is not None:
             return self.given_size
-        quick = max(2, len(self.residuals) - 2)
-        sizes = [
-            (share * self.data.force_rms, memory)
-            for memory in RECONSTRUCTION.memories
-            for share in RECONSTRUCTION.levels
-        ]
-
-        coarse = self._coarse_places
+        quick, memories, rms = max(2, len(self.residuals) - 2), RECONSTRUCTION.memories, self.data.force_rms
+        sizes = [(share * rms, memory) for memory in memories for share in RECONSTRUCTION.levels]
+        # a few places, close enough to any other
+        if isinstance(self.domain, Interval):
+            coarse = self.places[::5]
+        elif isinstance(self.domain, NamedPoints) and len(self.domain.names) <= RECONSTRUCTION.many_points:
+            coarse = self.domain.grid()
+        else:
+            coarse = self._likeliest_places[: RECONSTRUCTION.most_peaks]
 
         def likelihood(size: tuple[float, float]) -> float:
             return max(self._log_likelihood(x, size, quick) for x in coarse)
 
         return max(zip(self.workers.map(likelihood, sizes), sizes, strict=True), key=lambda each: each[0])[1]
-
-    @property
-    def _coarse_places(self) -> Sequence[Any]:
-        """A few places, close enough to any other to estimate the size of the force."""
-        if isinstance(self.domain, Interval):
-            every_fifth: Sequence[Any] = self.places[::5]
-            return every_fifth
-        if isinstance(self.domain, NamedPoints) and len(self.domain.names) <= RECONSTRUCTION.many_points:
-            return self.domain.grid()
-        return self._likeliest_places[: RECONSTRUCTION.most_peaks]
 
     @cached_property
     def profile(self) -> np.ndarray:
@@ -237,22 +223,19 @@ class ForceReconstruction:
     def misfit(self, where: Location, lines: Sequence[Lines] | None = None) -> float:
         """Residual sum of squares given one force of any law at a place, transients included, in units of the noise.
 
-        Args:
-            where: the place.
-            lines: weighted ones; None for all, with equal weights.
+        lines: weighted ones; None for all, with equal weights.
         """
         shape = self.rig.modes.phi_at(where)
         return float(sum(each.misfit(shape) for each in (self.lines if lines is None else lines)))
 
     def misfits(self, places: Sequence[Any], lines: Sequence[Lines]) -> Floats:
-        """The misfit at each of the places."""
         return np.array(self.workers.map(lambda where: self.misfit(where, lines), places))
 
     def screened(self, places: Sequence[Any], lines: Sequence[Lines] | None = None) -> Floats:
         """The approximate misfit at each of many places, without transients."""
         shapes = np.array([self.rig.modes.phi_at(where) for where in places])
-        misfits: Floats = np.sum([screened(each, shapes) for each in (self.lines if lines is None else lines)], axis=0)
-        return misfits
+        chosen = self.lines if lines is None else lines
+        return np.asarray(np.sum([screened(each, shapes) for each in chosen], axis=0))
 
     @cached_property
     def _likeliest_places(self) -> tuple[Any, ...]:
@@ -268,17 +251,15 @@ class ForceReconstruction:
 
     def _distinct_pairs(self, ranked: Sequence[Any], pairs: Sequence[int]) -> list[int]:
         """The first few pairs with different mode shapes: pairs across a stiff floor, say, count as one place."""
-        kept: list[int] = []
-        shapes: list[np.ndarray] = []
+        kept: dict[int, Floats] = {}
         for i in pairs:
             shape = self.rig.modes.phi_at(ranked[i])
             shape = shape / max(float(np.linalg.norm(shape)), 1e-300)
-            if all((shape @ other) ** 2 < 1.0 - RECONSTRUCTION.alike for other in shapes):
-                kept.append(i)
-                shapes.append(shape)
+            if all((shape @ other) ** 2 < 1.0 - RECONSTRUCTION.alike for other in kept.values()):
+                kept[i] = shape
             if len(kept) == RECONSTRUCTION.pairs_tried:
                 break
-        return kept
+        return [*kept]
 
     @property
     def _along(self) -> int:
@@ -287,23 +268,18 @@ class ForceReconstruction:
 
     def _peaks_over(self, rectangle: Rectangle, ranked: Sequence[Any]) -> tuple[tuple[float, float], ...]:
         """Refined peaks over a rectangle, best first; mirrored places are tried too, as a plate is nearly symmetric."""
-        (a, b), peaks_found = (
-            rectangle.length,
-            _spaced(ranked, rectangle, RECONSTRUCTION.broad, RECONSTRUCTION.most_peaks),
-        )
+        (a, b), finer = rectangle.length, RECONSTRUCTION.finer
+        peaks_found = _spaced(ranked, rectangle, RECONSTRUCTION.broad)
         mirrored = [image for x, y in peaks_found for image in ((x, y), (a - x, y), (x, b - y), (a - x, b - y))]
-        offsets = (
-            max(a, b) / self._along * np.arange(-RECONSTRUCTION.finer, RECONSTRUCTION.finer + 1) / RECONSTRUCTION.finer
-        )
+        offsets = max(a, b) / self._along * np.arange(-finer, finer + 1) / finer
         around = [
             [(float(np.clip(x + dx, 0.0, a)), float(np.clip(y + dy, 0.0, b))) for dx in offsets for dy in offsets]
             for x, y in mirrored
         ]
         misfits = self.screened([where for places in around for where in places]).reshape(len(around), -1)
         refined = [places[int(np.argmin(row))] for places, row in zip(around, misfits, strict=True)]
-        misfits_there = self.workers.map(self.misfit, refined)
-        order = np.argsort(misfits_there, kind="stable")
-        return tuple(_spaced([refined[i] for i in order], rectangle, RECONSTRUCTION.narrow, RECONSTRUCTION.most_peaks))
+        order = np.argsort(self.workers.map(self.misfit, refined), kind="stable")
+        return tuple(_spaced([refined[i] for i in order], rectangle, RECONSTRUCTION.narrow))
 
     @cached_property
     def peaks(self) -> tuple[Any, ...]:
@@ -319,12 +295,9 @@ class ForceReconstruction:
     def _refined_peak(self, at: float) -> tuple[float, float]:
         """The peak of the log-likelihood near a place of the grid: position and height."""
         spacing = self.places[1] - self.places[0]
-        found = minimize_scalar(
-            lambda x: -self._log_likelihood(x, self.size),
-            bounds=(at - RECONSTRUCTION.beside * spacing, at + RECONSTRUCTION.beside * spacing),
-            method="bounded",
-            options={"xatol": RECONSTRUCTION.resolved * spacing},
-        )
+        beside, options = RECONSTRUCTION.beside * spacing, {"xatol": RECONSTRUCTION.resolved * spacing}
+        how: Any = {"method": "bounded", "bounds": (at - beside, at + beside), "options": options}
+        found = minimize_scalar(lambda x: -self._log_likelihood(x, self.size), **how)
         return float(found.x), -float(found.fun)
 
     @cached_property
@@ -335,36 +308,28 @@ class ForceReconstruction:
 
     def place(self, where: Location) -> ForceAndMotion:
         """The smoothed unmodelled force at a place, and the motion there."""
-        filters = self.filters_at(where, self.size)
-        n, shape = self.rig.modes.n_modes, self.rig.modes.phi_at(where)
+        filters, modes = self.filters_at(where, self.size), self.rig.modes
+        n, shape = modes.n_modes, modes.phi_at(where)
         pieces = []
         for dt, motion, residual in zip(self.sample_times, self.motions, self.residuals, strict=True):
             states = smoothed_states(filters[dt], residual)
             error_q, error_v, force = states[:n], states[n : 2 * n], states[2 * n]
-            error_a = -(self.rig.modes.omega[:, None] ** 2) * error_q - self.rig.modes.damping @ error_v
-            pieces.append(
-                (
-                    force,
-                    shape @ (motion.displacement + error_q),
-                    shape @ (motion.velocity + error_v),
-                    shape @ (motion.acceleration + error_a) + shape @ shape * force,
-                )
-            )
+            error_a = -(modes.omega[:, None] ** 2) * error_q - modes.damping @ error_v
+            w, v = shape @ (motion.displacement + error_q), shape @ (motion.velocity + error_v)
+            pieces.append((force, w, v, shape @ (motion.acceleration + error_a) + shape @ shape * force))
         force, w, v, a = (np.concatenate(series) for series in zip(*pieces, strict=True))
         return ForceAndMotion(where, force, w, v, a, self.absorbed)
 
 
-def _spaced(
-    ranked: Sequence[tuple[float, float]], rectangle: Rectangle, share: float, most: int
-) -> list[tuple[float, float]]:
+def _spaced(ranked: Sequence[tuple[float, float]], rectangle: Rectangle, share: float) -> list[tuple[float, float]]:
     """The first few places, best first, that are farther than a share of the diagonal from those before them."""
-    peaks_found: list[tuple[float, float]] = []
+    found: list[tuple[float, float]] = []
     for where in ranked:
-        if all(rectangle.separation(where, other) > share for other in peaks_found):
-            peaks_found.append(where)
-        if len(peaks_found) == most:
+        if all(rectangle.separation(where, other) > share for other in found):
+            found.append(where)
+        if len(found) == RECONSTRUCTION.most_peaks:
             break
-    return peaks_found
+    return found
 
 
 def minima(values: Floats) -> np.ndarray:

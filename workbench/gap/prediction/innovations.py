@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from scipy.linalg import expm
@@ -20,7 +21,7 @@ from workbench.structure.modes import Modes
 
 LOOSE = 0.01  # of the inputs' rms: process noise forces that set the observer gain
 DOUBLINGS = 12  # squarings of the transition matrix in the test of stability: eight are enough for most
-RUN_AWAY = 1e100  # squared norm of a matrix power that can be squared once more without overflow
+DIVERGED = 1e100  # squared norm of a matrix power that can be squared once more without overflow
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,15 +50,10 @@ class Observer:
         rms: float = 0.0,
         loose: float = LOOSE,
     ) -> "Observer":
-        """The observer of a rig.
+        """The observer of a rig with sensors of noise standard deviations `noise` (n_outputs,).
 
-        Args:
-            rig: with the modes.
-            noise: (n_outputs,) standard deviation of each sensor's noise.
-            force: rms of the inputs, N.
-            sample_times: of the records, s.
-            at, rms: place and rms, N, of a further random force.
-            loose: rms of the process noise forces over that of the inputs: the less, the lower the gain.
+        force: rms of the inputs, N; at, rms: place and rms, N, of a further random force; loose: rms of the process
+        noise forces over that of the inputs: the less, the lower the gain.
         """
         modes, n = rig.modes, rig.modes.n_modes
         domain = modes.domain
@@ -79,17 +75,12 @@ class Observer:
     ) -> np.ndarray:
         """Innovations of unit covariance (n_outputs, n_samples) of a rig that is integrated in time.
 
-        The effect of delay, lag and clipping of sensors is taken from a simulation of the whole record.
-
-        Args:
-            rig: with its laws.
-            record: of its inputs and outputs.
-            substeps: of a sample.
-            motion: returns that of the whole record with these substeps, if it may be cached.
+        The effect of delay, lag and clipping of sensors is taken from a simulation of the whole record; motion: returns
+        it with these substeps, if it may be cached.
         """
         with np.errstate(over="ignore", invalid="ignore"):  # the simulation may diverge
-            errors: Floats = self.whitening[record.sample_time] @ self._innovations(rig, record, substeps, motion)
-        return errors
+            errors = self._innovations(rig, record, substeps, motion)
+            return np.asarray(self.whitening[record.sample_time] @ errors)
 
     def residual_on_measured_motion(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:
         """Residual (n_outputs, n_samples) of a whole record with nonlinear laws acting on the measured motion.
@@ -107,35 +98,24 @@ class Observer:
         self, rig: Rig, record: Record, substeps: int, motion: Callable[[], Motion] | None = None
     ) -> np.ndarray:
         """Innovations (n_outputs, n_samples), in the sensors' units."""
-        unrounded, measured, dt = _without_rounding(rig), record.outputs, record.sample_time
-        instantaneous = _instantaneous(unrounded)
-        if instantaneous is not unrounded:
-            if motion is None:
-                moved = move(rig, record.inputs, sample_time=dt, substeps=substeps, input_hold=record.input_hold)
-            else:
-                moved = motion()
-            measured = measured + read(instantaneous, moved) - read(unrounded, moved)
-        gain = self._gain_for(rig, dt)
-        hold = record.input_hold
-        return prediction_errors(
-            instantaneous, record.inputs, measured, gain, sample_time=dt, substeps=substeps, input_hold=hold
-        )
+        unquantised, measured, dt = _without_quantisation(rig), record.outputs, record.sample_time
+        how: Any = {"sample_time": dt, "substeps": substeps, "input_hold": record.input_hold}
+        instantaneous = _instantaneous(unquantised)
+        if instantaneous is not unquantised:
+            moved = move(rig, record.inputs, **how) if motion is None else motion()
+            measured = measured + read(instantaneous, moved) - read(unquantised, moved)
+        return prediction_errors(instantaneous, record.inputs, measured, self._gain_for(rig, dt), **how)
 
     def innovations_of_linear(self, rig: Rig, left: np.ndarray, sample_time: float, substeps: int) -> np.ndarray:
-        """Innovations of unit covariance (n_outputs, n_samples) of a linear rig, from its simulation residual.
+        """Innovations of unit covariance (n_outputs, n_samples) of a linear rig, from its residual of a whole record.
 
-        Args:
-            rig: linear.
-            left: (n_outputs, n_samples) measured minus predicted, of the whole record.
-            sample_time: s.
-            substeps: of a sample, if damping couples the modes.
+        substeps: of a sample, if damping couples the modes.
         """
         bare = _structure_only(rig)
         gain, no_inputs = self._gain_for(rig, sample_time), np.zeros((0, left.shape[1]))
         substeps = 1 if rig.modes.proportional else substeps
         errors = prediction_errors(bare, no_inputs, left, gain, sample_time=sample_time, substeps=substeps)
-        white: Floats = self.whitening[sample_time] @ errors
-        return white
+        return np.asarray(self.whitening[sample_time] @ errors)
 
     @lru_cache(maxsize=KEPT)  # noqa: B019  an observer is a few arrays
     def _gain_for(self, rig: Rig, sample_time: float) -> np.ndarray:
@@ -181,7 +161,7 @@ def _is_growing(step: Floats) -> bool:
         size = float(np.einsum("ij,ij->", power, power))
         if size < 1.0:
             return False
-        if size > RUN_AWAY:
+        if size > DIVERGED:
             break
     return bool(np.abs(np.linalg.eigvals(step)).max() > 1.0)
 
@@ -189,13 +169,12 @@ def _is_growing(step: Floats) -> bool:
 @lru_cache(maxsize=4)
 def _transition(modes: Modes, sample_time: float) -> Floats:
     """Transition matrix of the modes over a sample, (2 n_modes, 2 n_modes)."""
-    step: Floats = expm(modes.state_matrix * sample_time)
-    return step
+    return np.asarray(expm(modes.state_matrix * sample_time))
 
 
 @lru_cache(maxsize=KEPT)
-def _without_rounding(rig: Rig) -> Rig:
-    """The rig without rounding of sensors; the same object if none rounds."""
+def _without_quantisation(rig: Rig) -> Rig:
+    """The rig without quantisation of sensors; the same object if there is none."""
     if not any(sensor.step for sensor in rig.sensors):
         return rig
     return replace(rig, sensors=tuple(replace(s, step=0.0) if s.step else s for s in rig.sensors))

@@ -47,12 +47,8 @@ def noise_found(residuals: Sequence[np.ndarray], coloured: np.ndarray | None = N
     """Standard deviation of each sensor's noise (n_outputs,), in the sensors' units.
 
     Noise is equally strong in every record, while a model error grows with the level: the noise is at most the smallest
-    residual of all records. Model errors make peaks at the modes: the noise is at most the smooth spectrum, white or
-    coloured, under these peaks.
-
-    Args:
-        residuals: (n_outputs, n_samples) measured minus predicted, one per record.
-        coloured: (n_outputs,) of `are_coloured`, if known.
+    residual (n_outputs, n_samples) of all records. Model errors make peaks at the modes: the noise is at most the
+    smooth spectrum, white or coloured, under these peaks. coloured: (n_outputs,) of `are_coloured`, if known.
     """
     coloured = are_coloured(residuals) if coloured is None else coloured
     whole = np.sort([(residual**2).mean(axis=1) for residual in residuals], axis=0)
@@ -71,14 +67,10 @@ def are_coloured(residuals: Sequence[np.ndarray]) -> np.ndarray:
     Such noise has no peaks and is uncorrelated between sensors. The response to an unmodelled force has the peaks of
     the modes, or correlates between sensors; an offset or a drift is no noise either. False for a single sensor, and
     for records too short for the test.
-
-    Args:
-        residuals: (n_outputs, n_samples) measured minus predicted, one per record.
     """
     if len(residuals[0]) < 2:
         return np.zeros(1, bool)
-    coloured: np.ndarray = np.all([_is_coloured(left) for left in _prewhitened(residuals)], axis=0)
-    return coloured
+    return np.asarray(np.all([_is_coloured(left) for left in _prewhitened(residuals)], axis=0))
 
 
 def _is_coloured(prewhitened: Floats) -> np.ndarray:
@@ -109,10 +101,7 @@ def is_noise_alone(
 ) -> bool:
     """Whether the residual is noise, however loud: without peaks, and equally strong in records of different levels.
 
-    Args:
-        residuals: (n_outputs, n_samples) measured minus predicted, one per record.
-        records: measured.
-        coloured: (n_outputs,) of `are_coloured`, if known.
+    coloured: (n_outputs,) of `are_coloured`, if known.
     """
     levels = [(record.outputs**2).mean() for record in records]
     if max(levels) <= NOISE.louder * min(levels):
@@ -143,8 +132,7 @@ def noise_guessed(rig: Rig, records: Sequence[Record]) -> np.ndarray:
                 f"the records show no noise of sensor {sensor.name}, by which its residual is weighted: state its"
                 " noise_std"
             )
-    guess: Floats = np.sqrt(least / NOISE.of_least)
-    return guess
+    return np.asarray(np.sqrt(least / NOISE.of_least))
 
 
 def _band_means(residual: Floats, lines: int = NOISE.lines) -> Floats:
@@ -153,23 +141,21 @@ def _band_means(residual: Floats, lines: int = NOISE.lines) -> Floats:
     window = np.hanning(n_samples)
     spectrum = np.abs(np.fft.rfft(residual * window, axis=1)[:, 1:]) ** 2 / (n_samples * np.mean(window**2))
     bands = max(spectrum.shape[1] // lines, 1)
-    means: Floats = spectrum[:, : bands * (spectrum.shape[1] // bands)].reshape(n_outputs, bands, -1).mean(axis=2)
-    return means
+    whole = bands * (spectrum.shape[1] // bands)
+    return np.asarray(spectrum[:, :whole].reshape(n_outputs, bands, -1).mean(axis=2))
 
 
 def _power_under_peaks(residual: Floats) -> Floats:
     """Mean square (n_outputs,) under the peaks of the spectrum."""
     means = _band_means(residual)
-    under: Floats = np.minimum(means, _noise_floor(means)).mean(axis=1)
-    return under
+    return np.asarray(np.minimum(means, _noise_floor(means)).mean(axis=1))
 
 
 def _noise_floor(means: Floats) -> Floats:
     """Noise power of each band of a spectrum (n_outputs, n_bands), from the quieter of its neighbours."""
     reach = min(NOISE.reach, (means.shape[1] - 1) // 2)
     around = sliding_window_view(np.pad(means, ((0, 0), (reach, reach)), mode="reflect"), 2 * reach + 1, axis=1)
-    floor: Floats = np.quantile(around, NOISE.quiet, axis=2) * (1.0 + NOISE.lower / np.sqrt(NOISE.lines))
-    return floor
+    return np.asarray(np.quantile(around, NOISE.quiet, axis=2) * (1.0 + NOISE.lower / np.sqrt(NOISE.lines)))
 
 
 @dataclass(frozen=True)
@@ -197,10 +183,6 @@ def logging_noise_power(rig: Rig, data: FitData) -> np.ndarray:
 
     For white noise on each nonzero input, of the input's own rms. Noise of variance σ² on one input causes a variance
     σ² Σ h_k² at sample n, over k ≤ n of the response h to a pulse of one sample.
-
-    Args:
-        rig: nominal.
-        data: fit records.
     """
     longest = max(data.counted, key=lambda record: record.n_samples)
     pulses = np.eye(len(rig.actuators))[:, :, None] * (np.arange(longest.n_samples) == 0)
@@ -209,8 +191,7 @@ def logging_noise_power(rig: Rig, data: FitData) -> np.ndarray:
     so_far = (answers**2).cumsum(axis=2)  # (n_inputs, n_outputs, n_samples)
     by_input = [so_far[:, :, : record.n_samples].mean(axis=2) for record in data.counted]
     each = zip(data.counted, by_input, strict=True)
-    expected: Floats = np.array([(record.inputs**2).mean(axis=1) @ power for record, power in each]) / data.noise**2
-    return expected
+    return np.asarray([(record.inputs**2).mean(axis=1) @ power / data.noise**2 for record, power in each])
 
 
 def loudest_logging_noise(rig: Rig, data: FitData) -> np.ndarray:
@@ -220,8 +201,7 @@ def loudest_logging_noise(rig: Rig, data: FitData) -> np.ndarray:
 
     def power(record: Record) -> Floats:
         response = simulate_record(linear, replace(record, inputs=noise_of_inputs(record, rng)))
-        mean_square: Floats = (response**2).mean(axis=1) / data.noise**2
-        return mean_square
+        return np.asarray((response**2).mean(axis=1) / data.noise**2)
 
     draws = np.array([[power(record) for record in data.counted] for _ in range(LOGGED.draws)])
     loudest = draws.mean(axis=2).argmax(axis=0)
@@ -231,19 +211,15 @@ def loudest_logging_noise(rig: Rig, data: FitData) -> np.ndarray:
 def noise_of_inputs(record: Record, rng: np.random.Generator) -> Floats:
     """A draw of white noise on each input (n_inputs, n_samples), of the input's own rms, N."""
     rms = np.sqrt((record.inputs**2).mean(axis=1, keepdims=True))
-    noise: Floats = rms * rng.standard_normal(record.inputs.shape)
-    return noise
+    return np.asarray(rms * rng.standard_normal(record.inputs.shape))
 
 
 def logging_noise(by_channel: np.ndarray, sensor_noise: np.ndarray, per_unit: np.ndarray) -> float:
     """Input noise, as a share of the inputs' rms, from the median excess of the residual power.
 
-    The excess is that over the record with the weakest inputs, or over the sensor noise of a single record.
-
-    Args:
-        by_channel: (n_records, n_outputs) mean square residuals, in units of the stated noise.
-        sensor_noise: (n_outputs,) power of the sensors' noise, likewise.
-        per_unit: (n_records, n_outputs) of `logging_noise_power`.
+    The excess of mean square residuals (n_records, n_outputs), in units of the stated noise, is that over the record
+    with the weakest inputs, or over the sensor noise (n_outputs,) of a single record; per_unit: (n_records, n_outputs)
+    of `logging_noise_power`.
     """
     rows = np.arange(len(by_channel)) != np.argmin(per_unit.sum(axis=1))
     beyond, per = by_channel - sensor_noise, per_unit
@@ -255,12 +231,9 @@ def logging_noise(by_channel: np.ndarray, sensor_noise: np.ndarray, per_unit: np
 
 
 def input_filters(rig: Rig, data: FitData, share: float) -> dict[str, ForceFilter]:
-    """Whitening filters, by record, of the linear response to input noise plus sensor noise.
+    """Whitening filters, by record, of the response to input noise, a share of each input's rms, plus sensor noise.
 
-    Args:
-        rig: with the modes; its nonlinear laws and the dynamics of its actuators are left out.
-        data: records, with the sensors' noise.
-        share: standard deviation of white noise on each input, over the input's rms.
+    Nonlinear laws and the dynamics of actuators are left out.
     """
     sample_times = {record.sample_time for record in data.records}
     models = {dt: sampled_model(rig.modes, rig.sensors, data.noise, dt) for dt in sample_times}
@@ -290,14 +263,7 @@ class LikeliestShare(NamedTuple):
 
 
 def likeliest_share(rig: Rig, data: FitData, residuals: Sequence[np.ndarray]) -> LikeliestShare:
-    """Input noise by maximum likelihood of the residuals.
-
-    Args:
-        rig: with the modes that the noise excites.
-        data: records, with the sensors' noise.
-        residuals: (n_outputs, n_samples) measured minus predicted, one per record.
-    """
-
+    """Input noise by maximum likelihood of the residuals (n_outputs, n_samples) of each record."""
     by_record = np.array([_losses(rig, data, residuals, share) for share in (LOGGED.beyond, *SHARES)])
     beyond = bool(np.median(by_record.argmin(axis=0)) < 1.0)
     losses = by_record[1:].sum(axis=1)

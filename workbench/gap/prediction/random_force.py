@@ -126,12 +126,8 @@ def fit_random_force(
 ) -> RandomForceFit:
     """Maximum-likelihood estimate of place, strength and colour, from the best of a grid.
 
-    Args:
-        rig: that the force acts on.
-        data: records, with the sensors' noise.
-        residuals: (n_outputs, n_samples) a record, in the sensors' units.
-        places: to start from; for named points, all candidates.
-        size: a typical force, N.
+    residuals: (n_outputs, n_samples) a record, in the sensors' units; places: to start from, for named points all
+    candidates; size: a typical force, N.
     """
     model = sampled_model(rig.modes, rig.sensors, data.noise, data.counted[0].sample_time)
     residuals, domain = list(residuals), rig.modes.domain
@@ -139,25 +135,26 @@ def fit_random_force(
     extent = np.zeros(0) if isinstance(domain, NamedPoints) else np.atleast_1d(domain.length)
     d = extent.size  # coordinates of a place that can be fitted
 
-    def place_of(point: np.ndarray, start: Location) -> Location:
-        return start if d == 0 else same_place(point[:d] * extent)
-
     def memory_at(point: np.ndarray) -> float:
         return float(1.0 / (1.0 + np.exp(-point[d + 1])))
 
-    def loss(point: np.ndarray, family: tuple[Location, int, bool], records: list[np.ndarray]) -> float:
+    def force_at(point: np.ndarray, family: tuple[Location, int, bool]) -> tuple[Location, float, Floats]:
+        """Place, rms (N) and colour of the force."""
         start, stages, flat = family
-        memory = memory_at(point)
-        if not ((point[:d] >= 0.0) & (point[:d] <= 1.0)).all() or memory > RANDOM_FORCE.longest_memory:
+        at = start if d == 0 else same_place(point[:d] * extent)
+        return at, float(np.exp(point[d])), colour_of(memory_at(point), stages, flat=flat)
+
+    def loss(point: np.ndarray, family: tuple[Location, int, bool], records: list[np.ndarray]) -> float:
+        is_inside = ((point[:d] >= 0.0) & (point[:d] <= 1.0)).all()
+        if not is_inside or memory_at(point) > RANDOM_FORCE.longest_memory:
             return 1e300
-        kalman = _filter(model, rig, place_of(point, start), np.exp(point[d]), colour_of(memory, stages, flat=flat))
-        value = -2.0 * log_likelihood(kalman, records)
+        value = -2.0 * log_likelihood(_filter(model, rig, *force_at(point, family)), records)
         return value if np.isfinite(value) else 1e300
 
     grid = [
         (np.r_[within, np.log(size * share), np.log((memory + 1e-3) / (1.0 - memory))], (where, stages, flat))
         for where in places
-        for within in [np.atleast_1d(np.asarray(where)) / extent if extent.size else np.zeros(0)]
+        for within in [np.atleast_1d(np.asarray(where)) / extent if d else extent]
         for share in RANDOM_FORCE.sizes
         for memory, stages, flat in COLOURS
     ]
@@ -183,10 +180,9 @@ def fit_random_force(
         for first, family in list(likely.values())[: RANDOM_FORCE.families]
     ]
     nearest, family = min(refined_quick, key=lambda each: float(each[0].fun))
-    found, (beside, stages, flat) = refined(nearest.x, family, residuals, RANDOM_FORCE.evaluations), family
-    at, log_rms = place_of(found.x, beside), found.x[d]
-    colour = colour_of(memory_at(found.x), stages, flat=flat)
-    kalman = _filter(model, rig, at, np.exp(log_rms), colour)
+    found = refined(nearest.x, family, residuals, RANDOM_FORCE.evaluations)
+    at, rms, colour = force_at(found.x, family)
+    kalman = _filter(model, rig, at, rms, colour)
     n_values = sum(r.size for r in residuals)
     noise_part = sum(r.shape[1] for r in residuals) * np.sum(np.log(data.noise**2))
     both = [(r, smoothed_states(kalman, r)) for r in residuals]
@@ -194,7 +190,7 @@ def fit_random_force(
     forces = [x[force] for _, x in both]
     return RandomForceFit(
         at=at,
-        rms=float(np.exp(log_rms)),
+        rms=rms,
         at_std=tuple(
             _curvature_std(lambda p: loss(p, family, residuals), found.x, i, RANDOM_FORCE.curved_over)
             * float(extent[i])
@@ -253,11 +249,8 @@ def _power(colour: Floats) -> float:
 def followed(force: np.ndarray, inputs: np.ndarray, motion: np.ndarray) -> float:
     """Share of a force's power that linear regression on inputs and motion explains, less what chance would.
 
-    Args:
-        force: (n_samples,) N.
-        inputs: (n_inputs, n_samples); several lags of each are regressors.
-        motion: (2, n_samples) displacement and velocity at the force, simulated without it: the measured motion always
-            correlates with the force.
+    Several lags of each input are regressors; motion: (2, n_samples) displacement and velocity at the force, simulated
+    without it, as the measured motion always correlates with the force.
     """
     active = [row for row in inputs if np.any(row)]
     if not active:

@@ -70,7 +70,6 @@ class FitData:
 
     @property
     def n_values(self) -> int:
-        """Number of measured values."""
         return sum(record.outputs.size for record in self.counted)
 
     @property
@@ -114,23 +113,19 @@ class FitData:
     def with_nuisance(self, sensitivity: np.ndarray) -> "FitData":
         """The same residual, minimised over nuisance parameters with normal priors to first order.
 
-        Its sum of squares is min over δ of |r + S δ|² + |δ|²: the new residual is (I - S (Sᵀ S + I)⁻¹ Sᵀ)^½ r.
-
-        Args:
-            sensitivity: (n_values, n_parameters) S, each column times the prior standard deviation of its parameter.
+        Its sum of squares is min over δ of |r + S δ|² + |δ|²: the new residual is (I - S (Sᵀ S + I)⁻¹ Sᵀ)^½ r, with
+        the sensitivity S (n_values, n_parameters), each column times the prior standard deviation of its parameter.
         """
         if not sensitivity.size:
             return replace(self, nuisance=None)
-        _, sizes, turned = np.linalg.svd(_triangle(sensitivity))
+        _, sizes, vectors = np.linalg.svd(_triangle(sensitivity))
         root = np.sqrt(1.0 + sizes**2)
-        return replace(self, nuisance=sensitivity @ (turned[: root.size].T / np.sqrt(root * (root + 1.0))))
+        return replace(self, nuisance=sensitivity @ (vectors[: root.size].T / np.sqrt(root * (root + 1.0))))
 
     def one_step_ahead(self, rig: Rig, loose: float = LOOSE) -> "FitData":
         """The residual of one-step-ahead predictions, with a steady-state Kalman filter of this rig.
 
-        Args:
-            rig: that the filter is designed for.
-            loose: rms of process noise forces, as a share of the inputs: the less, the lower the observer gain.
+        loose: rms of process noise forces, as a share of the inputs: the less, the lower the observer gain.
         """
         if self.observer is not None:  # innovations with a random force are one-step-ahead errors already
             return replace(self, nuisance=None)
@@ -160,13 +155,9 @@ class FitData:
             if key in self._memory:
                 self._memory.move_to_end(key)
                 return self._memory[key][1]
-        motion = move(
-            rig,
-            record.inputs,
-            sample_time=record.sample_time,
-            substeps=self.substeps,
-            input_hold=record.input_hold,
-        ).after(lead_of(record, self.transient))
+        sample_time, hold = record.sample_time, record.input_hold
+        whole = move(rig, record.inputs, sample_time=sample_time, substeps=self.substeps, input_hold=hold)
+        motion = whole.after(lead_of(record, self.transient))
         with self._lock:
             self._memory[key] = (rig.modes, motion)
             while len(self._memory) > REMEMBERED * len(self.records):
@@ -175,10 +166,8 @@ class FitData:
 
     def predictions(self, rig: Rig) -> tuple[np.ndarray, ...]:
         """Predicted outputs (n_outputs, n_samples) of each record."""
-        return tuple(
-            read(rig.in_record(record.name), motion)
-            for record, motion in zip(self.counted, self.motions(rig), strict=True)
-        )
+        each = zip(self.counted, self.motions(rig), strict=True)
+        return tuple(read(rig.in_record(record.name), motion) for record, motion in each)
 
     def residual(self, rig: Rig) -> np.ndarray:
         """(measured - predicted) / noise, or innovations of unit variance, of all records end to end: (n_values,)."""
@@ -212,10 +201,8 @@ class FitData:
             ahead = [observer.innovations(r, record, substeps, partial(first._motion, r, record)) for r, record in rigs]
         else:
             whole = zip(self.records, self._from_the_first_sample.differences(rig), strict=True)
-            ahead = [
-                observer.innovations_of_linear(rig.in_record(record.name), left, record.sample_time, self.substeps)
-                for record, left in whole
-            ]
+            by_record = [(rig.in_record(record.name), left, record.sample_time) for record, left in whole]
+            ahead = [observer.innovations_of_linear(*each, self.substeps) for each in by_record]
         each_ahead = zip(self.records, ahead, strict=True)
         return np.concatenate([errors[:, lead_of(record, self.transient) :].ravel() for record, errors in each_ahead])
 
@@ -244,12 +231,9 @@ class FitData:
         """
         if observer is None or not is_stepped(rig) or rig.stiffness_rate:
             return self.differences(rig)
-        return [
-            observer.residual_on_measured_motion(rig.in_record(record.name), record, self.substeps)[
-                :, lead_of(record, self.transient) :
-            ]
-            for record in self.records
-        ]
+        each = [(rig.in_record(record.name), record) for record in self.records]
+        whole = [observer.residual_on_measured_motion(own, record, self.substeps) for own, record in each]
+        return [left[:, lead_of(r, self.transient) :] for left, r in zip(whole, self.records, strict=True)]
 
     def differences(self, rig: Rig) -> list[np.ndarray]:
         """Measured minus simulated outputs (n_outputs, n_samples) of each record, in the sensors' units."""
@@ -258,13 +242,10 @@ class FitData:
 
     def by_channel(self, residual: np.ndarray) -> np.ndarray:
         """Mean square of a residual by record and channel: (n_records, n_outputs)."""
-        rows, start = [], 0
-        for record in self.counted:
-            size = record.outputs.size
-            with np.errstate(over="ignore"):  # the simulation may diverge
-                rows.append((residual[start : start + size].reshape(record.outputs.shape) ** 2).mean(axis=1))
-            start += size
-        return np.array(rows)
+        ends = np.cumsum([record.outputs.size for record in self.counted])[:-1]
+        each = zip(np.split(residual, ends), self.counted, strict=True)
+        with np.errstate(over="ignore"):  # the simulation may diverge
+            return np.array([(own.reshape(record.outputs.shape) ** 2).mean(axis=1) for own, record in each])
 
 
 def _triangle(matrix: Floats) -> Floats:

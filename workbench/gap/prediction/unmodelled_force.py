@@ -18,9 +18,9 @@ from workbench.rig.linear import integrated
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.modes import Modes
 
-RUNAWAY = 1e100
+DIVERGED = 1e100  # innovations, in any unit
 WHITE = np.zeros((1, 1))  # colour of a force that is uncorrelated from sample to sample
-TETHER = 1e-4  # radians a sample: frequency given to rigid modes
+LEAST_FREQUENCY = 1e-4  # radians a sample: frequency given to rigid modes
 DOUBLINGS = 40  # of the number of samples of a sum or of a steady state, at most
 
 
@@ -45,11 +45,13 @@ class SampledModel:
     noise_variance: np.ndarray
 
 
-def _tethered(modes: Modes, sample_time: float) -> Modes:
+def _without_zero_frequencies(modes: Modes, sample_time: float) -> Modes:
     """The modes with rigid ones on a very soft spring, as velocity sensors do not observe their displacement."""
     if modes.omega.all():
         return modes
-    return replace(modes, omega=np.where(modes.omega > 0, modes.omega, TETHER / sample_time), damping=modes.damping)
+    return replace(
+        modes, omega=np.where(modes.omega > 0, modes.omega, LEAST_FREQUENCY / sample_time), damping=modes.damping
+    )
 
 
 def sampled_model(modes: Modes, sensors: tuple[Sensor, ...], noise: np.ndarray, sample_time: float) -> SampledModel:
@@ -58,7 +60,7 @@ def sampled_model(modes: Modes, sensors: tuple[Sensor, ...], noise: np.ndarray, 
     For a sensor that is late by more than a sample, forces are taken as held over the delay.
     """
     n = modes.n_modes
-    own = _tethered(modes, sample_time).state_matrix
+    own = _without_zero_frequencies(modes, sample_time).state_matrix
     a = np.zeros((3 * n, 3 * n))
     a[: 2 * n, : 2 * n] = own
     a[n : 2 * n, 2 * n :] = np.eye(n)
@@ -104,9 +106,8 @@ def force_filter(
 ) -> ForceFilter:
     """The filter for forces along `patterns` (n_modes, n_forces) with the given process variances.
 
-    Args:
-        colour: (n_stages, n_stages) transition of each force's shaping filter, from the force itself to the last stage,
-            which white noise drives; see `colour_of`.
+    colour: (n_stages, n_stages) transition of each force's shaping filter, from the force itself to the last stage,
+    which white noise drives; see `colour_of`.
     """
     n_state, m = model.transition.shape[0], patterns.shape[1]
     forces = n_state + len(colour) * m
@@ -145,24 +146,17 @@ def colour_of(memory: float, stages: int, *, flat: bool = False) -> Floats:
     return colour
 
 
-def wandering_force_filter(
+def gauss_markov_force_filter(
     modes: Modes, model: SampledModel, shape: np.ndarray, rms: float, correlation_time: float, sample_time: float
 ) -> ForceFilter:
-    """The filter for one force that is an Ornstein-Uhlenbeck process, discretised exactly.
+    """The filter for one force that is a first-order Gauss-Markov process, discretised exactly.
 
-    Forces of contact and friction vary within a sample too.
-
-    Args:
-        modes, model: of the rig, and its sampled form.
-        shape: (n_modes,) of the modes at the force.
-        rms: of the force, N.
-        correlation_time: s.
-        sample_time: s.
+    Forces of contact and friction vary within a sample too. shape: (n_modes,) at the force; rms, N; times, s.
     """
     n = modes.n_modes
     size = 2 * n + 1
     a = np.zeros((size, size))
-    modes = _tethered(modes, sample_time)
+    modes = _without_zero_frequencies(modes, sample_time)
     a[: 2 * n, : 2 * n] = modes.state_matrix
     a[n : 2 * n, -1] = shape
     a[-1, -1] = -1.0 / correlation_time
@@ -245,7 +239,7 @@ def log_likelihood(filter_: ForceFilter, residuals: Sequence[Floats]) -> float:
     found = 0.0
     for residual in residuals:
         e = innovations(filter_, residual)
-        if not np.abs(e).max() < RUNAWAY:
+        if not np.abs(e).max() < DIVERGED:
             return -np.inf
         try:
             white = _of_unit_covariance(filter_, e)
@@ -264,8 +258,8 @@ def whiten(filter_: ForceFilter, residual: Floats) -> Floats:
 def _of_unit_covariance(filter_: ForceFilter, errors: Floats) -> Floats:
     """Innovations (n_sensors, n_samples) scaled to unit covariance."""
     # innovations that have diverged may be nan, and stay so
-    white: Floats = solve_triangular(np.linalg.cholesky(filter_.innovation), errors, lower=True, check_finite=False)
-    return white
+    root = np.linalg.cholesky(filter_.innovation)
+    return np.asarray(solve_triangular(root, errors, lower=True, check_finite=False))
 
 
 def smoothed_states(filter_: ForceFilter, residual: Floats) -> Floats:
@@ -289,5 +283,4 @@ def smoothed_covariance(filter_: ForceFilter) -> Floats:
     h, p = filter_.h, filter_.covariance
     closed = filter_.a - filter_.gain @ h
     adjoint = accumulated(closed.T, h.T @ np.linalg.solve(filter_.innovation, h))
-    smoothed: Floats = p - p @ adjoint @ p
-    return smoothed
+    return np.asarray(p - p @ adjoint @ p)

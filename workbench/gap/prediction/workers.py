@@ -263,14 +263,12 @@ def _serve(work: Callable[[Any], Any], there: Connection, background: bool) -> N
 
 
 def _sent(found: Any) -> bytes:
-    """A pickled object."""
     out = BytesIO()
     _Sender(out, pickle.HIGHEST_PROTOCOL).dump(found)
     return out.getvalue()
 
 
 def _received(sent: bytes) -> Any:
-    """The object of `_sent`."""
     return _Receiver(BytesIO(sent)).load()
 
 

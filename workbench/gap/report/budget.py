@@ -21,35 +21,25 @@ from workbench.structure.domain import Domain
 
 AT_BOUND = 0.99  # of the largest noise that a search accepts: estimates above it are at the bound
 REMARKED = 1.3  # ratio of estimated and stated noise from which a remark is made
-# per cent rms: a quarter to a half more than the worst models of trials have; false local minima have larger errors
-LARGEST_SMALL = (
-    ("stiffness", 5.0),
-    ("mass", 5.0),
-    ("frequency", 2.5),
-    ("coupling", 5.0),
-    ("damping", 90.0),
-    ("gain", 5.0),
-    ("place", 1.0),
-    ("shape", 10.0),
-)
+# groups of errors that are reported in per cent: the name in the plural, and the largest small error, per cent rms, a
+# quarter to a half more than the worst models of trials have; false local minima have larger errors
+PERCENT = {
+    "stiffness": ("stiffness", 5.0),
+    "mass": ("mass", 5.0),
+    "frequency": ("frequencies", 2.5),
+    "coupling": ("coupling of modes", 5.0),
+    "damping": ("damping", 90.0),
+    "gain": ("gains", 5.0),
+    "place": ("places", 1.0),
+    "shape": ("shapes", 10.0),
+}
 MOSTLY = 0.5  # of the gap: its greater part; if that is unexplained, the fitted nominal errors have over-fitted it
-RUNAWAY = 1e30  # mean square of a divergent residual, in units of the signal's
+DIVERGED = 1e30  # mean square of a divergent residual, in units of the signal's
 COMMON = 2.0  # times the scatter of delays: a larger mean is reported as a common delay
 LEAST_DELAY = 1e-3  # of a sample: shorter delays are not reported
 DRAWS = 400  # bootstrap draws, for the interval of the shrinkage
 REACH = 4.0  # standard deviations from record to record: bound of the deviation of a held-out record
 TOLERANCE = 1e-3  # of that bound: accuracy of the deviation
-# names in the plural of the groups of errors that are reported in per cent
-PLURAL = {
-    "stiffness": "stiffness",
-    "mass": "mass",
-    "frequency": "frequencies",
-    "coupling": "coupling of modes",
-    "damping": "damping",
-    "gain": "gains",
-    "place": "places",
-    "shape": "shapes",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +73,7 @@ def measure(nominal: Rig, corrected: Rig, records: Sequence[Record], *, transien
         lead = lead_of(record, transient)
         measured = record.outputs[:, lead:]
         scale = scale_of(measured)
-        predicted = [simulate_record(rig, record)[:, lead:] for rig in (nominal, corrected)]
-        errors = [((measured - prediction) / scale) ** 2 for prediction in predicted]
+        errors = [((measured - simulate_record(rig, record)[:, lead:]) / scale) ** 2 for rig in (nominal, corrected)]
         noise = np.array([s.noise_std for s in nominal.sensors])[:, None] / scale
         before[record.name], after[record.name] = (float(np.sqrt(e.mean())) for e in errors)
         floor[record.name] = float(np.sqrt((noise**2).mean()))
@@ -192,7 +181,6 @@ class Budget:
 
     @property
     def is_mostly_unexplained(self) -> bool:
-        """Whether most of the gap is unexplained."""
         return self.unexplained > MOSTLY
 
     @property
@@ -231,15 +219,10 @@ def budget_of(
     one another would remove nothing one by one, or less.
 
     Args:
-        rig: nominal.
-        effects: that were named.
-        errors: of the nominal model; None if none were fitted; see `with_held_out` for those that vary by record.
-        records: held out of the fit, or the fitted ones if none were.
+        errors: of the nominal model; see `with_held_out` for those that vary from record to record.
         noise_found: (n_outputs,) estimated standard deviation of each sensor's noise.
         logged: noise of the logged inputs, as a share of their rms.
-        transient: seconds at the start of each record that are not compared.
     """
-
     labels, causes = labels_of(effects, rig.modes.domain), list(effects)
     common, varying = (None, None) if errors is None else parted(errors)
     if varying is not None:
@@ -266,9 +249,8 @@ def budget_of(
     whole = shares.sum(axis=1).clip(0.0) / max(nominal.sum(), 1e-300)
     whole = whole / max(whole.sum(), 1e-300)
     by_record = {r.name: shares[:, i] / max(nominal[i], 1e-300) for i, r in enumerate(records)}
-    of_inputs = {
-        r.name: float(by_inputs[i] / max(nominal[i], 1e-300)) for i, r in enumerate(records) if by_inputs[i] > 0
-    }
+    input_shares = zip(records, by_inputs / np.maximum(nominal, 1e-300), strict=True)
+    of_inputs = {record.name: float(share) for record, share in input_shares if share > 0}
     return Budget(
         effects={labels[i]: float(share) for i, share in zip(by_size, whole, strict=False)},
         nominal=float(whole[-3]),
@@ -292,17 +274,15 @@ def labels_of(effects: Sequence[Effect], domain: Domain) -> list[str]:
 
 
 def residual_powers(rig: Rig, effects: Sequence[Effect], records: Sequence[Record], transient: float) -> Floats:
-    """Mean square residual (n_records,) by a rig with effects, as `signal_power`; `RUNAWAY` for an impossible rig."""
+    """Mean square residual (n_records,) by a rig with effects, as `signal_power`; `DIVERGED` for an impossible rig."""
     try:
         corrected = apply_all(rig, effects)
     except (ValueError, np.linalg.LinAlgError):
-        return np.full(len(records), RUNAWAY)
+        return np.full(len(records), DIVERGED)
     # without one of two effects that balance each other, the response may diverge
     with np.errstate(over="ignore", invalid="ignore"):
-        powers = [
-            signal_power(record, record.outputs - simulate_record(corrected, record), transient) for record in records
-        ]
-    return np.array([power if power < RUNAWAY else RUNAWAY for power in powers])
+        powers = [signal_power(r, r.outputs - simulate_record(corrected, r), transient) for r in records]
+    return np.array([power if power < DIVERGED else DIVERGED for power in powers])
 
 
 def signal_power(record: Record, readings: np.ndarray, transient: float) -> float:
@@ -326,7 +306,7 @@ def power_of_inputs(rig: Rig, records: Sequence[Record], transient: float) -> np
 
 def are_small(sizes: Mapping[str, float]) -> bool:
     """Whether nominal errors of these sizes (`sizes_of`) are as small as those of a careful laboratory."""
-    return all(sizes.get(f"{PLURAL[group]}_percent", 0.0) < largest for group, largest in LARGEST_SMALL)
+    return all(sizes.get(f"{name}_percent", 0.0) < largest for name, largest in PERCENT.values())
 
 
 def sizes_of(errors: Effect | None) -> dict[str, float]:
@@ -337,15 +317,11 @@ def sizes_of(errors: Effect | None) -> dict[str, float]:
     """
     if errors is None:
         return {}
-    values = {group: list(in_group(errors.values, group).values()) for group in (*PLURAL, "delay")}
-    sizes = {
-        f"{name}_percent": 100.0 * float(np.sqrt(np.mean(np.square(values[group]))))
-        for group, name in PLURAL.items()
-        if values[group]
-    }
-    if np.abs(values["delay"]).max(initial=0.0) >= LEAST_DELAY:
-        sample_time = getattr(errors.target, "sample_time", 1.0)
-        delays = 1e3 * sample_time * np.array(values["delay"])
+    values = {name: list(in_group(errors.values, group).values()) for group, (name, _) in PERCENT.items()}
+    sizes = {f"{name}_percent": 100.0 * float(np.sqrt(np.mean(np.square(v)))) for name, v in values.items() if v}
+    in_samples = np.array([*in_group(errors.values, "delay").values()])
+    if np.abs(in_samples).max(initial=0.0) >= LEAST_DELAY:
+        delays = 1e3 * getattr(errors.target, "sample_time", 1.0) * in_samples
         common = float(delays.mean())
         if delays.size > 1 and abs(common) > COMMON * delays.std():
             sizes["common_delay_ms"] = common
@@ -384,7 +360,6 @@ class RecordToRecord:
 
     @property
     def label(self) -> str:
-        """Label in the budget."""
         return label_of(self.parameter)
 
     @property
@@ -430,12 +405,6 @@ def with_held_out(
     for record in records:
         name = f"record_{record.name}"
         if name not in values:
-            found = minimize_scalar(
-                power,
-                bounds=(-bound, bound),
-                args=(record, name),
-                method="bounded",
-                options={"xatol": TOLERANCE * bound},
-            )
-            values[name] = float(found.x)
+            how: Any = {"method": "bounded", "bounds": (-bound, bound), "options": {"xatol": TOLERANCE * bound}}
+            values[name] = float(minimize_scalar(power, args=(record, name), **how).x)
     return (*others, replace(errors, values=values))

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -54,9 +55,8 @@ def detectability(reconstruction: ForceReconstruction, *, catalogue: tuple[Kind,
     base = data.residual(rig)
     labels, responses, strengths = [], [], {}
     candidates = [(k, target) for k in catalogue if k.found_in != "residual" for target in k.targets(rig)]
-    for effect, change in reconstruction.workers.map(
-        lambda each: _first_detectable(*each, reconstruction, data, base), candidates
-    ):
+    found = reconstruction.workers.map(lambda each: _first_detectable(*each, reconstruction, data, base), candidates)
+    for effect, change in found:
         if effect is None:
             continue
         size = float(np.linalg.norm(change))
@@ -67,8 +67,7 @@ def detectability(reconstruction: ForceReconstruction, *, catalogue: tuple[Kind,
     correlation = np.abs(np.array(responses) @ np.array(responses).T) if responses else np.zeros((0, 0))
     same = [
         (labels[i], labels[j], float(correlation[i, j]))
-        for i in range(len(labels))
-        for j in range(i + 1, len(labels))
+        for i, j in combinations(range(len(labels)), 2)
         if correlation[i, j] > INDISTINGUISHABLE and labels[i].split("[")[0] != labels[j].split("[")[0]
     ]
     return Detectability(
@@ -158,7 +157,6 @@ class Experiment:
 
     @property
     def sentence(self) -> str:
-        """The proposal in a sentence."""
         one, other = map(in_words, self.alternatives)
         if not np.isfinite(self.seconds):
             return f"No experiment on this rig separates {one} from {other}."
@@ -203,13 +201,11 @@ def _separation(rig: Rig, best: Fit, alternative: Fit, trial: FitData) -> float:
             second, second_slopes = _response(rig, alternative.effects, trial)
         except (ValueError, np.linalg.LinAlgError):
             return 0.0
-    difference = first - second
-    slopes = [*first_slopes, *second_slopes]
-    tangent = np.column_stack(slopes) if slopes else np.zeros((difference.size, 0))
-    if not (np.isfinite(difference).all() and np.isfinite(tangent).all()):
+    difference, slopes = first - second, [*first_slopes, *second_slopes]
+    if not np.isfinite([difference, *slopes]).all():
         return 0.0
-    if tangent.shape[1]:
-        basis, singular, _ = np.linalg.svd(tangent, full_matrices=False)
+    if slopes:
+        basis, singular, _ = np.linalg.svd(np.column_stack(slopes), full_matrices=False)
         basis = basis[:, singular > 1e-9 * singular.max()]
         difference = difference - basis @ (basis.T @ difference)
     record = trial.records[0]

@@ -8,7 +8,7 @@ from workbench.gap.effects.effect import Effect
 from workbench.gap.effects.nominal import NominalPrior, deviations_of
 from workbench.gap.localisation.breakdown import BREAKDOWN
 from workbench.gap.prediction.residuals import lead_of
-from workbench.gap.report.budget import PLURAL, Budget, block_length
+from workbench.gap.report.budget import PERCENT, Budget, block_length
 from workbench.gap.report.verdict import Verdict
 from workbench.gap.search.attribute import Attribution
 from workbench.gap.search.jointly import too_large
@@ -30,8 +30,8 @@ def notes_of(
     verdict: Verdict,
     records: Sequence[Record],
     validation: Sequence[Record],
-    *,
     faults: Sequence[SetupFault],
+    *,
     errors: Effect | None,
     power: float,
     transient: float,
@@ -39,15 +39,8 @@ def notes_of(
 ) -> tuple[str, ...]:
     """The notes, in the order in which they are stated.
 
-    Args:
-        verdict: without notes.
-        records: that were fitted.
-        validation: held out of the fit.
-        faults: of the set-up.
-        errors: of the nominal model, those of held-out records included; None if none were fitted.
-        power: mean square of the gap, each sensor scaled by the standard deviation of its readings.
-        transient: seconds at the start of each record that are not compared.
-        seconds: limit of the search.
+    errors: of the nominal model, those of held-out records included; power: mean square of the gap, each sensor scaled
+    by the standard deviation of its readings; seconds: limit of the search.
     """
     found, budget, outcome = verdict.attribution, verdict.budget, verdict.outcome
     notes = [fault.sentence for fault in faults]
@@ -100,12 +93,7 @@ def steady_remainder(rig: Rig, records: Sequence[Record], *, transient: float = 
     """A remark if the residual above the noise is of the same size at all levels of the inputs; else None.
 
     Its rms is fitted by a power of the level; the standard error of the exponent follows from the scatter over blocks
-    of a record.
-
-    Args:
-        rig: corrected.
-        records: at several levels; those without inputs or with a residual at the noise floor are ignored.
-        transient: seconds at the start of each record that are not compared.
+    of a record. Records without inputs or with a residual at the noise floor are ignored.
     """
     noise = np.array([sensor.noise_std for sensor in rig.sensors])[:, None]
     by_level = []
@@ -163,7 +151,7 @@ def _of_large_errors(errors: Effect | None) -> Iterator[str]:
     """A note that nominal errors are so large that they may include an effect."""
     if errors is None or not isinstance(errors.target, NominalPrior):
         return
-    large = [PLURAL[group] for group in too_large(errors) if group in PLURAL]
+    large = [PERCENT[group][0] for group in too_large(errors) if group in PERCENT]
     if large:
         yield (
             f"The errors of the model in {joined_in_words(large)} are larger than those of a careful test: a linear"

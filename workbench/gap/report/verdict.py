@@ -143,12 +143,10 @@ class Verdict:
         elsewhere = explained and self._acting and not self._agrees(self._acting)
         if place.is_single_force is not False or elsewhere:
             return ""
-        residual = _percent(float(np.sqrt(1.0 - place.share)))
+        residual = f"the residual is {_percent(float(np.sqrt(1.0 - place.share)))}"
         if place.share > NEARLY_ALL:
-            return f"with a single point force, {at}, the residual is {residual} of the gap's rms, more than noise"
-        return (
-            f"no single point force explains all of the gap; with the best, {at}, the residual is {residual} of its rms"
-        )
+            return f"with a single point force, {at}, {residual} of the gap's rms, more than noise"
+        return f"no single point force explains all of the gap; with the best, {at}, {residual} of its rms"
 
     @property
     def nominal_errors(self) -> Effect | None:
@@ -185,23 +183,18 @@ class Verdict:
             if any(effect.kind.unpredictable for effect in self.effects):
                 text += ", part of which is unpredictable"
             text += self._rest + self._not_excluded
-        else:
-            text = "No effect of the catalogue, alone or with another, explains the gap"
-            if self.attribution.is_cut:
-                text = "None of the effects tried before the time limit explains the gap"
-            if not any_beyond(self.effects):
-                near = words and (self.shrinkage is None or self.shrinkage.overall >= NEAR)
-                beside = f" with {self._errors_named}" if self.budget.nominal >= SHOWN else ""
-                text += (
-                    f"; the best fit, {words}{beside}, would close {closed or 'part of it'}."
-                    if near
-                    else f"{self._rest}."
-                )
-            elif self.alternatives:
-                text += f" as well as {words}, which explains {closed or 'it'}{self._not_excluded}"
-            else:
-                text += f"; {words} explains {closed or 'it'}."
-        return text[0].upper() + text[1:]
+            return text[0].upper() + text[1:]
+        text = "No effect of the catalogue, alone or with another, explains the gap"
+        if self.attribution.is_cut:
+            text = "None of the effects tried before the time limit explains the gap"
+        if any_beyond(self.effects):
+            if self.alternatives:
+                return f"{text} as well as {words}, which explains {closed or 'it'}{self._not_excluded}"
+            return f"{text}; {words} explains {closed or 'it'}."
+        if not words or (self.shrinkage is not None and self.shrinkage.overall < NEAR):
+            return f"{text}{self._rest}."
+        beside = f" with {self._errors_named}" if self.budget.nominal >= SHOWN else ""
+        return f"{text}; the best fit, {words}{beside}, would close {closed or 'part of it'}."
 
     @property
     def _no_gap_in_words(self) -> str:
@@ -277,9 +270,8 @@ class Verdict:
     def _errors_in_words(self) -> str:
         """Sizes of the nominal errors, such as: (stiffness 0.4 %, damping 12 %)."""
         sizes = self.budget.errors
-        words = [
-            f"{n.removesuffix('_percent')} {v:.2g} %" for n, v in sizes.items() if n.endswith("percent") and v > 0.01
-        ]
+        percent = {name.removesuffix("_percent"): size for name, size in sizes.items() if name.endswith("percent")}
+        words = [f"{name} {size:.2g} %" for name, size in percent.items() if size > 0.01]
         common, delays = sizes.get("common_delay_ms", 0.0), sizes.get("delays_ms", 0.0)
         if common:
             late = "late" if common > 0 else "early"
@@ -289,7 +281,7 @@ class Verdict:
         return f" ({', '.join(words)})" if words else ""
 
     def _delay_in_words(self, delay: float) -> str:
-        """A delay with its unit; delay: in thousandths of the unit of time."""
+        """A delay, in thousandths of the unit of time, with its unit."""
         time = self.units.time
         return f"{delay:.2g} ms" if time == "s" else f"{1e-3 * delay:.2g} {time}"
 
@@ -327,14 +319,12 @@ class Verdict:
     def _gap(self) -> dict[str, dict[str, Any]]:
         """The gap of each validation record: rms error / rms signal before and after, and of noise alone."""
         shrink, logged = self.shrinkage, self.budget.input_noise
-        before = {} if shrink is None else shrink.before
-        of_inputs = {name: gap * float(np.sqrt(logged[name])) for name, gap in before.items() if name in logged}
-        return {
-            "before": all_rounded(before),
-            "after": all_rounded(shrink.after if shrink else {}),
-            "floor": all_rounded(shrink.floor if shrink else {}),
-            **({"input_noise": all_rounded(of_inputs)} if of_inputs else {}),
-        }
+        if shrink is None:
+            return {"before": {}, "after": {}, "floor": {}}
+        gaps = {"before": shrink.before, "after": shrink.after, "floor": shrink.floor}
+        of_inputs = {n: gap * float(np.sqrt(logged[n])) for n, gap in shrink.before.items() if n in logged}
+        gaps |= {"input_noise": of_inputs} if of_inputs else {}
+        return {name: all_rounded(by_record) for name, by_record in gaps.items()}
 
     def __repr__(self) -> str:
         return f"<Verdict on {self.case}: {self.sentence}>"
@@ -357,10 +347,7 @@ class Verdict:
             ],
             "where": breakdown_json(self.where),
             "gap": self._gap,
-            "shrinkage": {
-                **all_rounded(shrink.share if shrink else {}),
-                **({"ci95": all_rounded(shrink.ci95)} if shrink else {}),
-            },
+            "shrinkage": {**all_rounded(shrink.share), "ci95": all_rounded(shrink.ci95)} if shrink else {},
             "residual": {
                 "nominal": rounded(self.attribution.nominal_cost),
                 "corrected": rounded(self.attribution.best.cost),
@@ -419,6 +406,7 @@ def _place_json(where: Any) -> dict[str, Any]:
 
 def breakdown_json(where: GapBreakdown) -> dict[str, Any]:
     """The location of a gap as plain numbers."""
+    by_record = zip(where.record_names, where.record_gaps, where.input_levels, where.time_shares, strict=True)
     return {
         "path": where.path,
         "modes": list(where.modes),
@@ -432,20 +420,11 @@ def breakdown_json(where: GapBreakdown) -> dict[str, Any]:
             "single_force": where.place.is_single_force,
         },
         "by_mode": all_rounded(where.mode_shares),
-        "by_band": {
-            "edges_hz": all_rounded(where.band_edges_hz),
-            "shares": all_rounded(where.band_shares),
-        },
+        "by_band": {"edges_hz": all_rounded(where.band_edges_hz), "shares": all_rounded(where.band_shares)},
         "by_sensor": all_rounded(where.sensor_shares),
         "by_record": {
-            name: {
-                "gap": rounded(gap),
-                "input_rms": rounded(level),
-                "by_eighth": all_rounded(shares),
-            }
-            for name, gap, level, shares in zip(
-                where.record_names, where.record_gaps, where.input_levels, where.time_shares, strict=True
-            )
+            name: {"gap": rounded(gap), "input_rms": rounded(level), "by_eighth": all_rounded(shares)}
+            for name, gap, level, shares in by_record
         },
     }
 
@@ -546,9 +525,7 @@ def _percent(share: float) -> str:
 
 def _with_deviation(value: float, deviation: float) -> str:
     """A value with its standard deviation, such as 3.40 ± 0.01; without one that is negligible or unknown."""
-    if not deviation > 0 or not np.isfinite(deviation):
-        return f"{value:.4g}"
-    if deviation < 5e-4 * abs(value):
+    if not deviation > 0 or not np.isfinite(deviation) or deviation < 5e-4 * abs(value):
         return f"{value:.4g}"
     digits = max(0, -int(np.floor(np.log10(deviation))))
     if digits > 4 or abs(value) >= 1e5:

@@ -56,22 +56,16 @@ NEAR_TEN = 0.01  # relative: if all gains are as near to 10, an amplifier is as 
 def channel_faults(gap: Comparison, kinds: Collection[str]) -> list[SetupFault]:
     """The most probable certain fault, of all outputs or of channels that share it; else all that are in doubt.
 
-    Args:
-        gap: measured and simulated outputs.
-        kinds: kinds of candidates that may be accepted.
+    kinds: of candidates that may be accepted.
     """
-    n = len(gap.rig.sensors)
-    alike: dict[tuple[str, Any, bool], list[Candidate]] = {}
+    alike: dict[tuple[str, Any, bool], set[int]] = {}
     for candidate in accepted(gap):
         certain = _is_certain(gap, candidate)
         if candidate.kind in kinds and certain is not None:
-            alike.setdefault((candidate.kind, candidate.value, certain), []).append(candidate)
-            if certain and candidate.kind == "outputs" and len(candidate.at) == n:
-                return [with_doubt_by_record(gap, _fault(gap, candidate.kind, candidate.value, candidate.at, True))]
-    faults = [
-        with_doubt_by_record(gap, _fault(gap, kind, value, sorted({c for each in same for c in each.at}), certain))
-        for (kind, value, certain), same in alike.items()
-    ]
+            alike.setdefault((candidate.kind, candidate.value, certain), set()).update(candidate.at)
+            if certain and candidate.kind == "outputs" and len(candidate.at) == len(gap.rig.sensors):
+                return [_fault(gap, candidate.kind, candidate.value, candidate.at, True)]
+    faults = [_fault(gap, kind, value, sorted(at), certain) for (kind, value, certain), at in alike.items()]
     return [fault for fault in faults if fault.certain][:1] or faults
 
 
@@ -176,7 +170,7 @@ def output_in_other_unit(gap: Comparison) -> list[SetupFault]:
         from_ten = abs(abs(np.median(beside)) - np.log(10.0))
         is_calibrated = factor not in AMBIGUOUS or abs(np.median(off)) < max(error, CALIBRATED) < from_ten
         if (np.abs(off) < NEAREST).all() and is_calibrated:
-            found.append(with_doubt_by_record(gap, _fault(gap, "outputs", factor, (int(j),), True)))
+            found.append(_fault(gap, "outputs", factor, (int(j),), True))
     return found if len(found) == 1 else []
 
 
@@ -197,9 +191,7 @@ def _is_certain(gap: Comparison, candidate: Candidate) -> bool | None:
     (j,) = candidate.at
     if candidate.value in (G, 1.0 / G) and gap.rig.sensors[j].quantity != "acceleration":
         return None
-    with_factor, with_gain = (
-        gap.residual_power([by * p for p in gap.simulated]) for by in (factor, gap.gains[:, None])
-    )
+    with_factor, with_gain = (gap.residual_power([g * p for p in gap.simulated]) for g in (factor, gap.gains[:, None]))
     if gap.closed(with_factor)[j] < CLOSED:
         return None
     sums = n * with_factor[j], n * with_gain[j], n * gap.noise[j]
@@ -210,19 +202,14 @@ def _rests_on_one_mode(gap: Comparison, factor: float, affected: Flags | bool) -
     """Whether a sign, g or 2π rests on the bands of one mode of several, where a missing effect can imitate it.
 
     A resonance shifted past the excitation, or a sensor beyond a node, inverts the phase of one mode; another stiffness
-    gives it any gain.
-
-    Args:
-        gap: measured and simulated outputs.
-        factor: of the fault.
-        affected: (n_records, n_outputs, n_modes) bands whose misfit the correction changes; True for all.
+    gives it any gain. affected: (n_records, n_outputs, n_modes) bands whose misfit the correction changes.
     """
     n = int((compared_bands(gap.measured_spectra) & affected).any(axis=(0, 1)).sum())
     return factor in (-1.0, *AMBIGUOUS) and n < min(2, gap.rig.modes.n_modes)
 
 
 def _fault(gap: Comparison, kind: str, value: Any, at: Sequence[int], certain: bool) -> SetupFault:
-    """The fault of some channels; kind, value, at: as of `Candidate`."""
+    """The fault of some channels, as of `Candidate`."""
     rig = gap.rig
     names = [(rig.actuators if "inputs" in kind else rig.sensors)[c].name for c in at]
     fault_kind, fault_records, pair = kind, gap.record_names, ()
@@ -247,7 +234,8 @@ def _fault(gap: Comparison, kind: str, value: Any, at: Sequence[int], certain: b
     outputs = np.flatnonzero(gap.wide) if "inputs" in kind else list(at)
     after, before = (np.maximum(each.before - each.noise, 0.0)[outputs] for each in (gap.corrected(correction), gap))
     closes = float(np.median(1.0 - after / np.maximum(before, 1e-300)))  # of the power beyond the noise
-    return SetupFault(fault_kind, sentence, closes, correction, certain, fault_records, factor, pair)
+    fault = SetupFault(fault_kind, sentence, closes, correction, certain, fault_records, factor, pair)
+    return _with_doubt_by_record(gap, fault)
 
 
 def scaled_inputs(gap: Comparison) -> list[SetupFault]:
@@ -276,24 +264,24 @@ def scaled_inputs(gap: Comparison) -> list[SetupFault]:
     closes = gap.closes(*correction(rig, gap.records))
     if closes < CLOSED:
         return []
-    with_gains, noise = _sum_of_squares(target - matrix @ gains), float(gap.noise.sum()) * target.size / gap.noise.size
-    faults = []
+
+    def chi_squared(gains: Floats) -> float:
+        residual = target - matrix @ gains
+        return float(residual @ residual)
+
+    with_gains, noise, faults = chi_squared(gains), float(gap.noise.sum()) * target.size / gap.noise.size, []
     for factor in dict.fromkeys(wrong.values()):
         inputs = [p for p in wrong if wrong[p] == factor]
         names = [rig.actuators[p].name for p in inputs]
         with_factor = gains.copy()
         with_factor[inputs] = factor
-        sums = _sum_of_squares(target - matrix @ with_factor), with_gains, noise
+        sums = chi_squared(with_factor), with_gains, noise
         certain = not all(is_calibration_error(gains[p], factor, *sums, target.size) for p in inputs)
         sentence = sentence_of_inputs(names, factor, None if certain else gains[inputs] / factor - 1.0)
         kind = "sign" if factor == -1.0 else "unit"
         own = partial(inputs_times, dict.fromkeys(names, factor))
         faults.append(SetupFault(kind, sentence, closes, own, certain, gap.record_names, abs(factor)))
-    return [with_doubt_by_record(gap, fault) for fault in faults]
-
-
-def _sum_of_squares(values: Floats) -> float:
-    return float(values @ values)
+    return [_with_doubt_by_record(gap, fault) for fault in faults]
 
 
 def factor_near(gain: float) -> float | None:
@@ -307,12 +295,7 @@ def is_calibration_error(
 ) -> bool:
     """Whether a gain is near a factor of units by chance: it differs significantly, and explains far more.
 
-    Args:
-        gain: estimated by least squares.
-        factor: of units.
-        with_factor, with_gain: sums of squared residuals with the factor and with the gain.
-        noise: sum of squares of the noise.
-        n_samples: number of samples in each sum.
+    with_factor, with_gain, noise: sums of squares of both residuals and of the noise, over `n_samples`.
     """
     if factor not in AMBIGUOUS or abs(gain / factor - 1.0) < CALIBRATED:
         return False
@@ -320,7 +303,7 @@ def is_calibration_error(
     return bool(removed > GAIN_SHARE * (with_factor - noise) and removed * n_samples > GAIN_CHI2 * with_gain)
 
 
-def with_doubt_by_record(gap: Comparison, fault: SetupFault) -> SetupFault:
+def _with_doubt_by_record(gap: Comparison, fault: SetupFault) -> SetupFault:
     """The fault, marked as in doubt if the gains of the records that its correction improves differ.
 
     A factor of units is the same in all records; the gain of an amplifier that saturates depends on the level.

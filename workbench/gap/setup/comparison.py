@@ -52,7 +52,6 @@ class Spectra:
         return Spectra(lines, edges)
 
     def with_lines(self, lines: list[Complexes]) -> "Spectra":
-        """Spectra of other signals of the same records."""
         return Spectra(lines, self.edges)
 
     def select(self, at: Sequence[int]) -> "Spectra":
@@ -84,21 +83,12 @@ def band_misfit(measured: Spectra, simulated: Spectra, factor: float = 1.0) -> F
     A missing effect shifts resonances and changes the amplitudes of some bands, up or down; a fault of the set-up
     changes all bands alike.
     """
-    tiny = 1e-300
     with np.errstate(over="ignore", invalid="ignore"):
         of_y, of_p, both = measured.power, simulated.power, measured.cross_power(simulated)
-        ratio = 0.5 * (np.log(np.maximum(of_y, tiny)) - np.log(np.maximum(of_p * factor**2, tiny)))
-        correlation = np.sign(factor) * both / np.sqrt(np.maximum(of_y * of_p, tiny))
+        ratio = 0.5 * (np.log(np.maximum(of_y, 1e-300)) - np.log(np.maximum(of_p * factor**2, 1e-300)))
+        correlation = np.sign(factor) * both / np.sqrt(np.maximum(of_y * of_p, 1e-300))
         misfit = np.minimum(np.abs(ratio), LARGEST_LOG_RATIO) + 1.0 - correlation
         return np.asarray(np.nan_to_num(misfit, nan=LARGEST_LOG_RATIO + 1.0))
-
-
-def log_ratios(measured: Spectra, simulated: Spectra) -> Floats:
-    """Log of measured over simulated amplitude (n_records, n_signals, n_modes); NaN in bands that are not compared."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        of_y, of_p = (np.log(np.maximum(each.power, 1e-300)) for each in (measured, simulated))
-        ratio = 0.5 * (of_y - of_p)
-    return np.where(compared_bands(measured) & np.isfinite(ratio), ratio, np.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +121,7 @@ class Comparison:
         """The comparison of a rig with records; simulated: the simulations, if they are known."""
         measured = [record.outputs[:, lead_of(record, transient) :] for record in records]
         if simulated is None:
-            simulated = _compared_samples(measured, [simulated_by(rig, record) for record in records])
+            simulated = _simulated(rig, records, measured)
         power = sum((y**2).sum(axis=1) for y in measured) / sum(y.shape[1] for y in measured)
         scale = np.where(power > 0, power, 1.0)
         noise = np.array([s.noise_std for s in rig.sensors]) ** 2 / scale
@@ -153,7 +143,6 @@ class Comparison:
 
     @cached_property
     def by_record(self) -> list["Comparison"]:
-        """The comparison of each record alone."""
         pairs = zip(self.records, self.simulated, strict=True)
         return [Comparison.of(self.rig, (record,), self.transient, (simulated,)) for record, simulated in pairs]
 
@@ -168,7 +157,6 @@ class Comparison:
 
     @property
     def record_names(self) -> tuple[str, ...]:
-        """Names of the records."""
         return tuple(record.name for record in self.records)
 
     @cached_property
@@ -184,12 +172,10 @@ class Comparison:
 
     @cached_property
     def measured_spectra(self) -> Spectra:
-        """Spectra of the measured outputs."""
         return self.spectra_of(self.measured)
 
     @cached_property
     def simulated_spectra(self) -> Spectra:
-        """Spectra of the simulated outputs."""
         return self.spectra_of(self.simulated)
 
     @cached_property
@@ -200,7 +186,10 @@ class Comparison:
     @cached_property
     def log_ratios(self) -> Floats:
         """Log of measured over simulated amplitude (n_records, n_outputs, n_modes); NaN in bands not compared."""
-        return log_ratios(self.measured_spectra, self.simulated_spectra)
+        with np.errstate(over="ignore", invalid="ignore"):
+            of_y, of_p = (np.log(np.maximum(s.power, 1e-300)) for s in (self.measured_spectra, self.simulated_spectra))
+            ratio = 0.5 * (of_y - of_p)
+        return np.where(compared_bands(self.measured_spectra) & np.isfinite(ratio), ratio, np.nan)
 
     @property
     def n_samples(self) -> int:
@@ -226,7 +215,7 @@ class Comparison:
 
     def simulated_with(self, rig: Rig, records: Sequence[Record]) -> list[Floats]:
         """Readings (n_outputs, n_samples) of another rig for other records, at the samples that are compared."""
-        return _compared_samples(self.measured, [simulated_by(rig, record) for record in records])
+        return _simulated(rig, records, self.measured)
 
     def residual_power(self, simulated: Sequence[Floats]) -> Floats:
         """Mean square residual (n_outputs,) of simulations, as a share of the mean square measured."""
@@ -237,15 +226,12 @@ class Comparison:
     def closed(self, after: np.ndarray) -> np.ndarray:
         """Share (n_outputs,) of the residual power beyond the noise that is removed.
 
-        It counts as 0 if much of the signal remains, or if most of the signal is noise.
-
-        Args:
-            after: (n_outputs,) residual power after a correction.
+        It counts as 0 if much of the signal remains, or if most of the signal is noise. after: (n_outputs,) residual
+        power after a correction.
         """
         left = np.maximum(after - self.noise, 0.0)
-        return np.where(
-            (left > LARGEST_LEFT) | (self.noise > NOISY), 0.0, 1.0 - left / np.maximum(self.before - self.noise, 1e-300)
-        )
+        closed = 1.0 - left / np.maximum(self.before - self.noise, 1e-300)
+        return np.where((left > LARGEST_LEFT) | (self.noise > NOISY), 0.0, closed)
 
     def closes(self, rig: Rig, records: Sequence[Record]) -> float:
         """The share that a corrected rig and records close: the median over channels with a wide gap."""
@@ -253,9 +239,9 @@ class Comparison:
         return float(np.median(self.closed(after)[self.wide]))
 
 
-def _compared_samples(measured: Sequence[Floats], simulated: Sequence[Floats]) -> list[Floats]:
-    """The last samples of each simulation, as many as are measured after the transient."""
-    return [p[:, p.shape[1] - y.shape[1] :] for y, p in zip(measured, simulated, strict=True)]
+def _simulated(rig: Rig, records: Sequence[Record], measured: Sequence[Floats]) -> list[Floats]:
+    """The last samples of the simulation of each record, as many as are measured after the transient."""
+    return [simulated_by(rig, r)[:, r.n_samples - y.shape[1] :] for r, y in zip(records, measured, strict=True)]
 
 
 def simulated_by(rig: Rig, record: Record) -> Floats:

@@ -1,6 +1,6 @@
 """Faults of the test set-up: their sentences, and the corrections of rig and records."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -66,10 +66,8 @@ def without_faults(faults: Iterable[SetupFault], rig: Rig, records: Sequence[Rec
     corrected = tuple(records)
     for fault in faults:
         if fault.certain:
-            each = [
-                (r,) if fault.records and r.name not in fault.records else fault.correction(rig, (r,))[1]
-                for r in corrected
-            ]
+            others = {r.name for r in corrected if fault.records and r.name not in fault.records}
+            each = [(r,) if r.name in others else fault.correction(rig, (r,))[1] for r in corrected]
             corrected = tuple(record for one in each for record in one)
             rig, _ = fault.correction(rig, ())
     return rig, corrected
@@ -86,18 +84,18 @@ def agreeing(sentence: str, names: Sequence[str]) -> str:
     """The sentence with its first verb in the singular if there is one name."""
     if len(names) > 1:
         return sentence
-    for many, single in ((" are ", " is "), (" have ", " has "), (" look ", " looks ")):
-        if many in sentence:
-            return sentence.replace(many, single, 1)
-    return sentence
+    return _with_first(sentence, {" are ": " is ", " have ": " has ", " look ": " looks "})
 
 
 def with_may(what: str) -> str:
     """The clause with "may" before its first verb."""
-    for sure, may in ((" look ", " may look "), (" looks ", " may look "), (" are ", " may be "), (" is ", " may be ")):
-        if sure in what:
-            return what.replace(sure, may, 1)
-    return what
+    return _with_first(what, {" look ": " may look ", " looks ": " may look ", " are ": " may be ", " is ": " may be "})
+
+
+def _with_first(sentence: str, verbs: dict[str, str]) -> str:
+    """The sentence with the first of some verbs that it has replaced, once."""
+    old = next((verb for verb in verbs if verb in sentence), "")
+    return sentence.replace(old, verbs[old], 1) if old else sentence
 
 
 def doubtful(what: str, off: Floats) -> str:
@@ -112,11 +110,8 @@ def doubtful(what: str, off: Floats) -> str:
 def sentence_of_outputs(sensors: Sequence[Sensor], at: Sequence[int], factor: float, off: Floats | None) -> str:
     """What is wrong with outputs, and the correction; if with all outputs, also what the inputs may be instead.
 
-    Args:
-        sensors: of the rig.
-        at: indices of the outputs.
-        factor: measured over predicted amplitude, one of `FACTORS`.
-        off: relative differences of the gains from the factor, if it is in doubt.
+    factor: measured over predicted amplitude, of `FACTORS`; off: relative differences of the gains from it, if it is in
+    doubt.
     """
     names = [sensors[j].name for j in at]
     is_all = len(at) == len(sensors)
@@ -144,12 +139,10 @@ def records_alone(correction: Correction, rig: Rig, records: Sequence[Record]) -
 
 
 def without_record(name: str, rig: Rig, records: Sequence[Record]) -> Corrected:
-    """One record left out."""
     return rig, tuple(record for record in records if record.name != name)
 
 
 def without_output(name: str, rig: Rig, records: Sequence[Record]) -> Corrected:
-    """One output left out of rig and records."""
     sensors = tuple(sensor for sensor in rig.sensors if sensor.name != name)
     return replace(rig, sensors=sensors), tuple(r.select_outputs([s.name for s in sensors]) for r in records)
 
@@ -162,7 +155,6 @@ def outputs_times(factors: dict[str, float], rig: Rig, records: Sequence[Record]
 
 
 def inputs_times(factors: dict[str, float], rig: Rig, records: Sequence[Record]) -> Corrected:
-    """Inputs of the records multiplied by factors."""
     by = np.array([factors.get(actuator.name, 1.0) for actuator in rig.actuators])
     return rig, tuple(replace(record, inputs=by[:, None] * record.inputs) for record in records)
 
@@ -170,25 +162,19 @@ def inputs_times(factors: dict[str, float], rig: Rig, records: Sequence[Record])
 def exchanged(side: str, one: str, other: str, rig: Rig, records: Sequence[Record]) -> Corrected:
     """Two channels of the records exchanged; side: "inputs" or "outputs"."""
     names = [transducer.name for transducer in (rig.actuators if side == "inputs" else rig.sensors)]
-    order = list(range(len(names)))
-    i, j = names.index(one), names.index(other)
-    order[i], order[j] = j, i
+    order = [names.index({one: other, other: one}.get(name, name)) for name in names]
     return rig, tuple(replace(record, **{side: getattr(record, side)[order]}) for record in records)
 
 
-def relabelled(rig: Rig, names: Iterable[str], quantity: str) -> Rig:
-    """The rig with another quantity stated for some of its sensors."""
-    named = set(names)
-    return replace(rig, sensors=tuple(replace(s, quantity=quantity) if s.name in named else s for s in rig.sensors))
+def relabelled(rig: Rig, names: Collection[str], quantity: str) -> Rig:
+    return replace(rig, sensors=tuple(replace(s, quantity=quantity) if s.name in names else s for s in rig.sensors))
 
 
 def quantity_set(names: frozenset[str], quantity: str, rig: Rig, records: Sequence[Record]) -> Corrected:
-    """Another quantity stated for some sensors, and the records unchanged."""
     return relabelled(rig, names, quantity), tuple(records)
 
 
 def rate_times(factor: float, rig: Rig, records: Sequence[Record]) -> Corrected:
-    """The sampling rates of the records multiplied by a factor."""
     return rig, tuple(replace(r, sample_time=r.sample_time / factor) for r in records)
 
 
@@ -200,9 +186,8 @@ def outputs_earlier(samples: float, rig: Rig, records: Sequence[Record]) -> Corr
     for record in records:
         n, outputs = record.n_samples, record.outputs
         moved = later(outputs, np.full(len(outputs), -part)) if part else outputs
-        corrected.append(
-            replace(record, outputs=moved[:, before : n - after], inputs=record.inputs[:, after : n - before])
-        )
+        kept, driven = slice(before, n - after), slice(after, n - before)
+        corrected.append(replace(record, outputs=moved[:, kept], inputs=record.inputs[:, driven]))
     return rig, tuple(corrected)
 
 

@@ -18,7 +18,7 @@ from workbench.gap.setup.channels import (
 )
 from workbench.gap.setup.comparison import AFFECTED, CLOSED, Comparison, compared_bands
 from workbench.gap.setup.corrections import SetupFault, records_alone, without_faults
-from workbench.gap.setup.records import check_names, copied, repeated
+from workbench.gap.setup.records import check_names, copied_channels, repeated
 from workbench.gap.setup.sampling import late_records, modal_units, sampling_rates
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
@@ -46,17 +46,13 @@ def setup_faults(
     Faults are detected in all fit records together, and each is kept for the records that agree with it; then each
     record is tested for faults of its own.
 
-    Args:
-        rig: nominal.
-        records: with the rig's inputs and outputs, in its order.
-        validation: likewise, kept out of every fit.
-        transient: seconds at the start of each record that are not compared.
+    All records have the rig's inputs and outputs, in its order; the first `transient` seconds are not compared.
 
     Raises:
         ValueError: two records of one name.
     """
     check_names((*records, *validation))
-    found = [*repeated(records), *copied(rig, records)]
+    found = [*repeated(records), *copied_channels(rig, records)]
     (corrected, fit), (_, held_out) = (without_faults(found, rig, these) for these in (records, validation))
     together = Comparison.of(corrected, fit, transient)
     alone = [*together.by_record, *(Comparison.of(corrected, (record,), transient) for record in held_out)]
@@ -89,11 +85,8 @@ def exchanges(faults: Iterable[SetupFault], records: Sequence[Record]) -> tuple[
     """The exchanges of two channels that all of these records surely have, as effects."""
     names = {record.name for record in records}
     kinds = {"exchanged inputs": SWAPPED_INPUTS, "exchanged outputs": SWAPPED_OUTPUTS}
-    return tuple(
-        Effect(kinds[fault.kind], fault.pair, {})
-        for fault in faults
-        if fault.pair and fault.certain and names <= set(fault.records or names)
-    )
+    of_all = (f for f in faults if f.pair and f.certain and names <= set(f.records or names))
+    return tuple(Effect(kinds[fault.kind], fault.pair, {}) for fault in of_all)
 
 
 def _in_rounds(gap: Comparison, detectors: Sequence[Detector]) -> list[SetupFault]:
@@ -165,6 +158,5 @@ def _for_one_record(what: str, record: Record, fault: SetupFault) -> SetupFault:
     sentence = fault.sentence
     if fault.kind != "sample rate":  # such a sentence names its record
         sentence = f"In {what} {record.name}, {sentence[0].lower()}{sentence[1:]}"
-    return replace(
-        fault, sentence=sentence, records=(record.name,), correction=partial(records_alone, fault.correction)
-    )
+    own = partial(records_alone, fault.correction)
+    return replace(fault, sentence=sentence, records=(record.name,), correction=own)

@@ -45,8 +45,7 @@ def check_records(
 ) -> None:
     """Refuse records, to be fitted or held out, whose channels are not, or cannot be, those of the rig.
 
-    Args:
-        transient: seconds at the start of each record that are not compared.
+    The first `transient` seconds of each record are not compared.
 
     Raises:
         RecordsError: for channels that are not the rig's in its order, a sensor with the wrong sign or in other units,
@@ -67,7 +66,7 @@ def check_alive(
 ) -> None:
     """Refuse records of other channels or few samples, and channels that are saturated or flat: no model is needed.
 
-    Args, Raises: as `check_records`.
+    Raises: as `check_records`.
     """
     channels = ("input", [a.name for a in rig.actuators]), ("output", [s.name for s in rig.sensors])
     for record in (*records, *validation):
@@ -97,7 +96,6 @@ def check_alive(
 
 
 def _is_driven(record: Record) -> bool:
-    """Whether any input of a record is not zero."""
     return bool(np.any(record.inputs))
 
 
@@ -124,10 +122,9 @@ def _check_dead(rig: Rig, levels: Levels) -> None:
 
 
 def _check_signs_and_units(rig: Rig, records: Sequence[Record], what: str, transient: float) -> Levels:
-    """Refuse records that are too short or disagree in sign or unit with the model; return the levels of driven ones.
+    """Refuse records, named `what`, that are too short or disagree in sign or unit with the model.
 
-    Args:
-        what: name of such records in a message.
+    Returns the levels of driven ones.
     """
     elastic = rig.modes.omega[rig.modes.omega > 0]
     levels: Levels = {}
@@ -150,13 +147,13 @@ def _check_signs_and_units(rig: Rig, records: Sequence[Record], what: str, trans
         ratios.append(_amplitude_ratios(rig, *level, np.abs(row) > CORRELATED))
     if not levels:
         return levels
-    _check_units(rig, records[0], np.array(ratios), np.abs(correlations) > CORRELATED, what)
-    inverted = np.flatnonzero((np.array(correlations) < WRONG_SIGN).all(axis=0))
+    correlation = np.array(correlations)
+    _check_units(rig, records[0], np.array(ratios), np.abs(correlation) > CORRELATED, what)
+    inverted = np.flatnonzero((correlation < WRONG_SIGN).all(axis=0))
     if inverted.size and inverted.size < len(rig.sensors):
-        name = rig.sensors[inverted[0]].name
         raise RecordsError(
-            f"output {name!r} reads with the wrong sign: its correlation with the model is"
-            f" {np.array(correlations)[:, inverted[0]].mean():.2f} in every {what}; reverse its sign"
+            f"output {rig.sensors[inverted[0]].name!r} reads with the wrong sign: its correlation with the model is"
+            f" {correlation[:, inverted[0]].mean():.2f} in every {what}; reverse its sign"
         )
     return levels
 
@@ -164,9 +161,7 @@ def _check_signs_and_units(rig: Rig, records: Sequence[Record], what: str, trans
 def _amplitude_ratios(rig: Rig, read: np.ndarray, expected: np.ndarray, is_correlated: np.ndarray) -> np.ndarray:
     """Standard deviation (n_sensors,) of each reading over that of its prediction; NaN where one is below the noise.
 
-    Args:
-        read, expected: (n_sensors,) standard deviations of the readings and of the predictions.
-        is_correlated: (n_sensors,) whether the two are correlated, which shows that the reading is not just noise.
+    Correlation with the prediction shows that a reading is not just noise.
     """
     least = ABOVE_NOISE * np.array([sensor.noise_std for sensor in rig.sensors])
     comparable = (expected > least) & ((read > least) | is_correlated)
@@ -178,12 +173,7 @@ def _check_units(rig: Rig, record: Record, ratios: np.ndarray, is_correlated: np
 
     An unmodelled excitation may be far stronger than the inputs, but is not correlated with the response to them. If
     all outputs read 500 times too little, no correlation is required: no effect reduces the response so much.
-
-    Args:
-        record: any, for its units.
-        ratios: (n_records, n_sensors) of `_amplitude_ratios`.
-        is_correlated: (n_records, n_sensors) whether readings and predictions are correlated.
-        what: name of such records in a message.
+    ratios, is_correlated: (n_records, n_sensors); record: any, for its units.
     """
 
     def side(some: np.ndarray, factor: float = WRONG_UNIT) -> int:
@@ -195,9 +185,10 @@ def _check_units(rig: Rig, record: Record, ratios: np.ndarray, is_correlated: np
     wrong = [j for j, column in enumerate(correlated.T) if side(column)]
     n_known = np.isfinite(ratios).any(axis=0).sum()
     if n_known > 1 and (side(ratios, NO_EFFECT) < 0 or (wrong and side(ratios))):
+        units = dict.fromkeys(channel.unit for channel in (*record.input_channels, *record.output_channels))
         raise RecordsError(
             f"the outputs read about {_median_in_words(ratios)} times the prediction of the model in every {what}: are"
-            f" outputs, inputs and model in consistent units, {_units(record)}?"
+            f" outputs, inputs and model in consistent units, {', '.join(filter(None, units))}?"
         )
     if not wrong:
         return
@@ -213,12 +204,6 @@ def _median_in_words(ratios: np.ndarray) -> str:
     return f"{float(f'{np.nanmedian(ratios):.2g}'):g}"
 
 
-def _units(record: Record) -> str:
-    """The units of all channels of a record, each once."""
-    units = (channel.unit for channel in (*record.input_channels, *record.output_channels))
-    return ", ".join(dict.fromkeys(unit for unit in units if unit))
-
-
 def check_modes(rig: Rig) -> None:
     """Refuse a rig whose modes are not those of its structure.
 
@@ -232,24 +217,20 @@ def check_modes(rig: Rig) -> None:
     modes, own = rig.modes, modes_of(rig.structure, rig.modes.n_modes)
     remedy = "; take the structure's own modes, or structure=None for modes of your own"
     off = np.abs(modes.omega - own.omega) > OFF_FREQUENCY * np.maximum(own.omega, own.omega[-1] / own.n_modes**2)
-    if off.any():
-        r = int(np.argmax(off))
+    for r in np.flatnonzero(off):
         raise ValueError(
             f"mode {r + 1} of the rig has {modes.frequencies_hz[r]:.6g} Hz, that of its structure"
             f" {own.frequencies_hz[r]:.6g} Hz{remedy}"
         )
     damping, expected = np.diag(modes.damping), np.diag(own.damping)
     off = np.abs(damping - expected) > OFF_DAMPING * np.maximum(expected, expected.max() / own.n_modes**2)
-    if off.any():
-        r = int(np.argmax(off))
+    for r in np.flatnonzero(off):
         raise ValueError(
             f"mode {r + 1} of the rig is damped by {damping[r]:.4g} rad/s, that of its structure by"
             f" {expected[r]:.4g} rad/s{remedy}"
         )
     masses = _modal_masses(modes, rig.structure)
-    off = np.abs(masses - 1.0) > OFF_MASS
-    if off.any():
-        r = int(np.argmax(off))
+    for r in np.flatnonzero(np.abs(masses - 1.0) > OFF_MASS):
         raise ValueError(
             f"mode {r + 1} of the rig is not mass-normalised: its modal mass ∫ m φ² is {masses[r]:.4g}, not 1; divide"
             f" its shape by {np.sqrt(masses[r]):.4g}{remedy}"
@@ -261,11 +242,10 @@ def _modal_masses(modes: Modes, structure: Structure | Plate | Membrane) -> Floa
     if isinstance(modes.domain, NamedPoints):
         raise ValueError("modes at named points are not those of a structure with a length; give structure=None")
     places, weights = modes.domain.quadrature(QUADRATURE)
-    density = (
-        structure.mass_per_length(places)
-        if isinstance(structure, Structure)
-        else structure.mass_per_area(places[:, 0], places[:, 1])
-    )
+    if isinstance(structure, Structure):
+        density = structure.mass_per_length(places)
+    else:
+        density = structure.mass_per_area(*places.T)
     masses: Floats = (weights * density) @ modes.phi(places) ** 2
     for part in () if isinstance(structure, Membrane) else structure.attachments:
         if isinstance(part, PointMass):

@@ -1,8 +1,9 @@
 """Faults of the records themselves: repeated, started in motion, with channels that are copied, stuck or clipped."""
 
+from collections import Counter
 from collections.abc import Sequence
 from functools import partial
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 
@@ -29,12 +30,11 @@ def check_names(records: Sequence[Record]) -> None:
     Raises:
         ValueError: for the first such name.
     """
-    names = [record.name for record in records]
-    for name in names:
-        if names.count(name) > 1:
+    for name, count in Counter(record.name for record in records).items():
+        if count > 1:
             raise ValueError(
-                f"{names.count(name)} records are called {name!r}, and results are by record: give each a name of its"
-                " own, such as replace(record, name=...)"
+                f"{count} records are called {name!r}, and results are by record: give each a name of its own, such as"
+                " replace(record, name=...)"
             )
 
 
@@ -44,34 +44,28 @@ def check_disjoint(records: Sequence[Record], validation: Sequence[Record]) -> N
     Raises:
         ValueError: for the first such pair.
     """
-    for held_out in validation:
-        for record in records:
-            if held_out.repeats(record):
-                raise ValueError(
-                    f"validation record {held_out.name!r} repeats the fit record {record.name!r}, so it validates"
-                    " nothing; keep another record for validation, or none"
-                )
+    for held_out, record in product(validation, records):
+        if held_out.repeats(record):
+            raise ValueError(
+                f"validation record {held_out.name!r} repeats the fit record {record.name!r}, so it validates nothing;"
+                " keep another record for validation, or none"
+            )
 
 
 def repeated(records: Sequence[Record]) -> list[SetupFault]:
     """Faults of records that hold the same samples as another; the later one is left out."""
-    faults, repeats = [], set()
+    faults: list[SetupFault] = []
+    repeats: set[int] = set()
     for i, j in combinations(range(len(records)), 2):
-        if j not in repeats and i not in repeats and records[i].repeats(records[j]):
+        if not {i, j} & repeats and records[i].repeats(records[j]):
             repeats.add(j)
             first, second = records[i].name, records[j].name
-            faults.append(
-                SetupFault(
-                    "repeated record",
-                    f"The records {first} and {second} hold the same samples: leave {second} out.",
-                    np.nan,
-                    partial(without_record, second),
-                )
-            )
+            sentence = f"The records {first} and {second} hold the same samples: leave {second} out."
+            faults.append(SetupFault("repeated record", sentence, np.nan, partial(without_record, second)))
     return faults
 
 
-def copied(rig: Rig, records: Sequence[Record]) -> list[SetupFault]:
+def copied_channels(rig: Rig, records: Sequence[Record]) -> list[SetupFault]:
     """Faults of outputs that copy another: the noise of two sensors differs, so equal samples are of one.
 
     The output that agrees less with the model is the copy.
@@ -84,39 +78,27 @@ def copied(rig: Rig, records: Sequence[Record]) -> list[SetupFault]:
         same = all(np.array_equal(r.outputs[i], r.outputs[j]) for r in records)
         if not same or may_agree or {i, j} & copies or not any(np.ptp(r.outputs[i]) for r in records):
             continue
-        errors = [np.zeros(2)]
-        for record in records:
-            predicted = simulated_by(rig, record)
-            errors.append(np.array([((record.outputs[k] - predicted[k]) ** 2).mean() for k in (i, j)]))
-        error_i, error_j = np.sum(errors, axis=0)
+        errors = [(record.outputs - simulated_by(rig, record))[[i, j]] for record in records]
+        error_i, error_j = np.sum([(error**2).mean(axis=1) for error in errors], axis=0)
         copy = j if error_i <= error_j else i
         copies.add(copy)
-        kept = i + j - copy
-        faults.append(
-            SetupFault(
-                "copied channel",
-                f"The outputs {one.name} and {other.name} hold the same samples, and the model agrees better with"
-                f" {rig.sensors[kept].name}: measure {rig.sensors[copy].name} again, or leave it out.",
-                np.nan,
-                partial(without_output, rig.sensors[copy].name),
-            )
+        kept, copied = rig.sensors[i + j - copy].name, rig.sensors[copy].name
+        sentence = (
+            f"The outputs {one.name} and {other.name} hold the same samples, and the model agrees better with {kept}:"
+            f" measure {copied} again, or leave it out."
         )
+        faults.append(SetupFault("copied channel", sentence, np.nan, partial(without_output, copied)))
     return faults
 
 
 def data_faults(rig: Rig, records: Sequence[Record], *, transient: float = 0.0) -> tuple[str, ...]:
     """One sentence for each record that starts in motion or is clipped and each stuck channel, with the correction.
 
-    Args:
-        rig: nominal.
-        records: with the rig's inputs and outputs, in its order.
-        transient: seconds at the start of each record that are not compared.
+    With a transient (s), which is not compared, a record may start in motion.
     """
     found = []
     for record in records:
-        found += [] if transient else _in_motion(rig, record)
-        found += _stuck(record)
-        found += _clipped(record)
+        found += [*([] if transient else _in_motion(rig, record)), *_stuck(record), *_clipped(record)]
     return tuple(found)
 
 

@@ -38,7 +38,6 @@ CLEAR = 4.0  # times the noise power: a smaller residual of an output shows no d
 
 
 def sampling_rates(gap: Comparison) -> list[SetupFault]:
-    """Faults of the stated sampling rates of records."""
     rig, records = gap.rig, gap.records
     wrong: dict[float, list[int]] = {}
     for i, (record, own) in enumerate(zip(records, gap.by_record, strict=True)):
@@ -80,22 +79,15 @@ def modal_units(gap: Comparison) -> list[SetupFault]:
         for factor, words in ((TURN, "Hz where rad/s is"), (1.0 / TURN, "rad/s where Hz is")):
             sentence = f"The natural frequencies look like {words} meant: multiply them by {factor:.6g}."
             candidates.append(("frequency", sentence, partial(modes_times, factor, 1.0)))
-    faults = [
-        SetupFault(kind, sentence, gap.closes(*correction(rig, records)), correction)
-        for kind, sentence, correction in candidates
-    ]
-    faults = [fault for fault in faults if fault.closes >= CLOSED]
-    return sorted(faults, key=lambda fault: -fault.closes)[:1]
+    faults = [SetupFault(kind, what, gap.closes(*by(rig, records)), by) for kind, what, by in candidates]
+    return sorted((fault for fault in faults if fault.closes >= CLOSED), key=lambda fault: -fault.closes)[:1]
 
 
 def late_records(gaps: Sequence[Comparison]) -> list[SetupFault]:
     """Faults of records that are late or early beside others that the same inputs drive, where the delays differ.
 
     A delay is one of all outputs, by which they agree best with the prediction; each of these records must show its
-    own. Where the inputs differ, so may the delays of their actuators.
-
-    Args:
-        gaps: each of one record.
+    own. Where the inputs differ, so may the delays of their actuators. gaps: each of one record.
     """
     driven = [gap for gap in gaps if np.any(gap.records[0].inputs)]
     if not driven:
@@ -158,12 +150,11 @@ def _delay_of(gap: Comparison) -> float | None:
     whole = int(tried[np.argmax(np.fft.irfft(cross, n)[tried])])
     if whole in (tried[0], tried[-1]):
         return None
-    found = minimize_scalar(
-        lambda delay: -float((cross * np.exp(1j * at * delay)).real.sum()),
-        bounds=(whole - 1.0, whole + 1.0),
-        method="bounded",
-    )
-    return float(found.x)
+
+    def loss(delay: float) -> float:
+        return -float((cross * np.exp(1j * at * delay)).real.sum())
+
+    return float(minimize_scalar(loss, bounds=(whole - 1.0, whole + 1.0), method="bounded").x)
 
 
 def _closed(gap: Comparison, delay: float) -> float:
