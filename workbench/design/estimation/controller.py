@@ -14,7 +14,7 @@ import numpy as np
 
 from workbench.design.estimation.modal_filter import ModalFilter
 from workbench.design.laws.law import Law, linear
-from workbench.renamed import Renamed, former_fields
+from workbench.renamed import former_fields
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.statespace import output_matrix, signal_names
 from workbench.structure.domain import Place
@@ -48,9 +48,6 @@ class Controller(Printed):
     name: str
     L: np.ndarray | None = None
     designed_by: Callable[[Modes, Law, Sequence[Sensor]], "Controller"] | None = None
-
-    state, reads, commands, direct = Renamed("A"), Renamed("B"), Renamed("C"), Renamed("D")
-    estimator = Renamed("L")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sensors", tuple(self.sensors))

@@ -19,7 +19,7 @@ from scipy.signal import cont2discrete
 from workbench.arguments import number
 from workbench.arrays import Floats
 from workbench.design.estimation.controller import Controller
-from workbench.renamed import Renamed, former_fields
+from workbench.renamed import former_fields
 from workbench.rig.statespace import signal_names
 from workbench.structure.modes import freeze, frozen
 
@@ -97,8 +97,6 @@ class DigitalController:
     friction: FrictionFeedforward | None = None
     name: str = "controller"
     states: tuple[str, ...] = ()
-
-    a, b, c, d, e = (Renamed(letter) for letter in "ABCDE")
 
     def __post_init__(self) -> None:
         n_sensors, n_actuators = len(self.sensors), len(self.actuators)

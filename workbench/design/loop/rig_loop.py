@@ -50,7 +50,6 @@ class LoopTest:
     forces: np.ndarray | None = None
     exciters: tuple[Actuator, ...] = ()
     seed: int | None = None
-    ports = Renamed("exciters")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "n_samples", whole(self.n_samples, "LoopTest.n_samples"))

@@ -12,7 +12,7 @@ import numpy as np
 from workbench.design.laws.law import DesignError
 from workbench.design.placement.places import Box, coordinates, free_boxes, least_distances
 from workbench.design.placement.task import Placement, PlacementTask, batch_costs
-from workbench.renamed import Renamed, former_fields
+from workbench.renamed import former_fields
 from workbench.rig.actuators import command_unit
 from workbench.structure.domain import Interval, NamedPoints, Place, Rectangle, position, reach, same_place
 from workbench.structure.printed import Constructed, command_headings, in_unit
@@ -53,8 +53,6 @@ class Limits(Constructed):
     edge_distance: float = 0.0
     forbidden: tuple[Zone, ...] = ()
     candidates: tuple[Place, ...] | None = None
-
-    margin = Renamed("edge_distance")
 
     def __post_init__(self) -> None:
         for name in BOUNDED:

@@ -19,7 +19,7 @@ from workbench.design.laws.law import DesignError, Law, weighed_states
 from workbench.design.loop.peak import largest
 from workbench.design.placement.places import as_places, coordinates, least_distances
 from workbench.design.spillover.spillover import settled_moments
-from workbench.renamed import Renamed, former_arguments, former_fields
+from workbench.renamed import former_arguments, former_fields
 from workbench.rig.actuators import Actuator, command_unit
 from workbench.rig.rig import Rig
 from workbench.structure.domain import (
@@ -76,8 +76,6 @@ class Placement(Printed):
     local_optima: tuple[tuple[np.ndarray, float], ...] = ()
     spacing: float = np.inf
     overlapping: bool = False
-
-    by_mode = Renamed("residual_work_by_mode")
 
     def __post_init__(self) -> None:
         freeze(self, "positions", dtype=None)

@@ -115,8 +115,6 @@ class Explanation(Printed):
     reduced_decay_rate: float
     destabilising: PoleShift | None
 
-    reduced_margin = Renamed("reduced_decay_rate")
-
     @property
     def limiting(self) -> PoleShift | None:
         """The residual mode that has the rightmost pole; None where a controlled mode or the controller has it."""

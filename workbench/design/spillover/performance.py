@@ -53,7 +53,7 @@ class Performance:
     spillover: float
     decay_rate: float
 
-    spilled, margin = Renamed("spillover"), Renamed("decay_rate")
+    spilled = Renamed("spillover")
 
 
 def performance(loop: ClosedLoop, state: np.ndarray, *, weight: float, final_time: float) -> Performance:

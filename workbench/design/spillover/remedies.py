@@ -12,7 +12,7 @@ import numpy as np
 
 from workbench.design.estimation.controller import Controller
 from workbench.design.loop.closed_loop import close_with, rounding
-from workbench.renamed import Renamed, former_arguments, former_fields
+from workbench.renamed import former_arguments, former_fields
 from workbench.rig.actuators import Actuator
 from workbench.structure.domain import (
     Between,
@@ -58,8 +58,6 @@ class Remedy:
     size: float
     decay_rate: float
     controller: Controller
-
-    margin = Renamed("decay_rate")
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from workbench.design.estimation.controller import Controller
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.loop.closed_loop import close_with
 from workbench.design.spillover.spillover import finite_spillover
-from workbench.renamed import Renamed, former_fields
+from workbench.renamed import former_fields
 from workbench.structure.modes import Modes, freeze
 from workbench.threads import one_blas_thread
 
@@ -35,8 +35,6 @@ class Robustness:
 
     decay_rates: np.ndarray
     work: np.ndarray
-
-    margins = Renamed("decay_rates")
 
     def __post_init__(self) -> None:
         freeze(self, "decay_rates", "work")

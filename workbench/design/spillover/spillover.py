@@ -47,8 +47,8 @@ class Spillover(Printed):
     controlled: tuple[int, ...]
     final_time: float
 
-    by_mode, residual = Renamed("work_by_mode"), Renamed("residual_modes")
-    controlled_total, residual_total = Renamed("controlled_work"), Renamed("residual_work")
+    residual, controlled_total = Renamed("residual_modes"), Renamed("controlled_work")
+    residual_total = Renamed("residual_work")
 
     def __post_init__(self) -> None:
         freeze(self, "work_by_mode")
