@@ -19,7 +19,7 @@ from workbench.trials.hold import ALIKE, draw_imperfect_kinds
 from workbench.trials.imperfections import IMPERFECTIONS, MIMICS, SIZES, with_imperfections
 from workbench.trials.make import make_trial
 from workbench.trials.plant import Plant
-from workbench.trials.scoring import reliability, score_imperfect, tally_imperfect
+from workbench.trials.scoring import imperfect_statistics, reliability, score_imperfect
 
 
 @pytest.fixture(scope="module")
@@ -253,7 +253,7 @@ def test_two_of_three_count_where_the_budget_says_that_something_is_left():
 def test_shares_are_of_what_there_is_to_count():
     right = score_imperfect({"effects": [TOLD], "budget": {"unexplained": 0.2}}, LABEL, domain=10.0)
     silent = score_imperfect({"effects": []}, LABEL, domain=10.0)
-    counted = tally_imperfect([right, silent])
+    counted = imperfect_statistics([right, silent])
     assert counted["named"] == 0.5 and counted["wrong"] == 0.0 and counted["false_alarms"] == 0
     assert counted["covered"] == pytest.approx(2 / 3) and counted["honest"] == 0.0 and counted["placed"] == 1.0
 

@@ -29,9 +29,8 @@ def plot_redesign(result: Redesign) -> Figure:
     for name, verification, colour in both:
         middle, low, high = np.clip(verification.energy / max(top, 1e-300), 1e-9, 1e3)
         left.fill_between(time, low, high, color=colour, alpha=0.25, linewidth=0)
-        left.semilogy(
-            time, middle, color=colour, linewidth=1.2, label=f"{name}: stable on {verification.share_stable:.0%}"
-        )
+        label = f"{name}: stable on {verification.share_stable:.0%}"
+        left.semilogy(time, middle, color=colour, linewidth=1.2, label=label)
     left.axhline(SETTLED, color=GREY, linewidth=0.8)
     left.annotate("settling threshold", (time[-1], SETTLED), (0, 3), textcoords="offset points", fontsize=8, ha="right")
     left.set(xlabel=f"time [{result.units.time}]", ylabel="modal energy over its peak", ylim=(1e-6, 3.0))
@@ -69,11 +68,8 @@ def plot_steps(result: Redesign) -> Figure:
 def plot_prediction(prediction: Prediction, measured: Record | None = None) -> Figure:
     """Two rows per sensor: readings over time and amplitudes of their Fourier transform; both less the prediction.
 
-    The lower row shows the band about zero, which may be far narrower than the readings.
-
-    Args:
-        prediction: with its bands.
-        measured: the record of the test, drawn on top, around the reading farthest outside its band.
+    The lower row shows the band about zero, which may be far narrower than the readings. A measured record is drawn on
+    top, around the reading farthest outside its band.
     """
     shown = min(len(prediction.channels), MOST_SENSORS)
     figure, axes = new_figure(2 * shown, 2, width=11, height=1.2 + 3.2 * shown, sharex="col", squeeze=False)
@@ -82,9 +78,8 @@ def plot_prediction(prediction: Prediction, measured: Record | None = None) -> F
     time, f = prediction.time[piece], prediction.frequencies_hz[1:]
     band = {"color": BAND, "alpha": 0.3, "linewidth": 0, "label": f"{100 * LEVEL:g} % band"}
     line, test = {"color": BAND, "linewidth": 0.9, "label": "predicted"}, {"color": TEST, "linewidth": 0.9}
-    for j in range(shown):
+    for j, channel in enumerate(prediction.channels[:shown]):
         (left, right), below = axes[2 * j], axes[2 * j + 1]
-        channel = prediction.channels[j]
         reading = rows.get(channel.name)
         middle, low, high = (y[j, piece] for y in (prediction.median, prediction.lower, prediction.upper))
         left.fill_between(time, low, high, **band)

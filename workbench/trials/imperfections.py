@@ -94,20 +94,15 @@ def _with_part(plant: Plant, name: str, size: float, bench: Bench, rng: np.rando
         return replace(plant, actuators=_each(actuators, gain=gains[:n]), sensors=_each(sensors, gain=gains[n:]))
     if name == "place" and not isinstance(domain, NamedPoints):
         places = _off_places(domain, [transducer.at for transducer in transducers], PLACED * size, rng)
-        return replace(
-            plant,
-            actuators=_each(actuators, at=places[:n]),
-            sensors=_each(sensors, at=[middle(at) for at in places[n:]]),
-        )
+        read_at = [middle(at) for at in places[n:]]
+        return replace(plant, actuators=_each(actuators, at=places[:n]), sensors=_each(sensors, at=read_at))
     return plant
 
 
 def _each(transducers: Any, **values: list[Any]) -> Any:
     """The actuators or sensors with a value of each field for each of them."""
-    return tuple(
-        replace(transducer, **{name: each[i] for name, each in values.items()})
-        for i, transducer in enumerate(transducers)
-    )
+    rows = (dict(zip(values, row)) for row in zip(*values.values(), strict=True))
+    return tuple(replace(transducer, **row) for transducer, row in zip(transducers, rows, strict=True))
 
 
 def _off_places(

@@ -30,13 +30,7 @@ MOST_BARREN = 2
 
 @dataclass(frozen=True)
 class Job:
-    """One case to be computed.
-
-    Attributes:
-        key: of the result.
-        arguments: of the function.
-        file: to which the computing process writes the result; None if this process does.
-    """
+    """One case to be computed; the computing process writes the result to `file`, if one is given."""
 
     key: str
     arguments: Mapping[str, Any]
