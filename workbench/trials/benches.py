@@ -59,9 +59,8 @@ def draw_bench(rng: np.random.Generator, structure: str = MEMBERS) -> Bench:
     plant = bench.plant().solved()
     commands = multisine(bench, rng)
     moved, _ = plant.move(commands, bench.sample_time)
-    widest = np.sqrt(np.mean((plant.at_actuators @ moved[0].T) ** 2, axis=1)).max()
+    widest, fastest = (np.sqrt(np.mean((plant.at_actuators @ m.T) ** 2, axis=1)).max() for m in moved[:2])
     level = float(f"{rig.modes.domain.size * np.exp(rng.uniform(np.log(0.001), np.log(0.02))) / widest:.2g}")
-    fastest = np.sqrt(np.mean((plant.at_actuators @ moved[1].T) ** 2, axis=1)).max()
     low = plant.readings(moved, bench.sample_time).std(axis=1) * level * LEVELS["low"]
     noise = [float(f"{10 ** (-snr_db / 20) * value:.6g}") for value in low]
     sensors = tuple(replace(s, noise_std=n) for s, n in zip(rig.sensors, noise, strict=True))

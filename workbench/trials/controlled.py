@@ -83,8 +83,8 @@ def control_plant(
     inputs = [a.name for a in plant.actuators]
     commanded = [inputs.index(name) for name in controller.actuators]
     noise = np.zeros((len(plant.sensors), n_samples))
-    for row, sensor in zip(noise, plant.sensors, strict=True) if rng is not None else ():
-        row[:] = sensor.noise_std * sensor_noise(rng, n_samples, plant.noise_memory)
+    if rng is not None:
+        noise = np.array([s.noise_std * sensor_noise(rng, n_samples, plant.noise_memory) for s in plant.sensors])
     reading = _Reading(real, controller, noise)
     held = real.random_forces(n_samples, dt, rng)
     state = motion.at_rest(system, n_samples)

@@ -150,10 +150,8 @@ def reliability(scores: Iterable[dict[str, Any]]) -> list[Reliability]:
     """
     claims = np.array([claim for s in scores for claim in s["claims"]], float).reshape(-1, 2)
     ranges = np.minimum((claims[:, 0] * BINS).astype(int), BINS - 1)
-    there = [claims[ranges == k] for k in range(BINS)]
-    return [
-        Reliability(float(p.mean()), float(right.mean()), p.size) for p, right in (some.T for some in there) if p.size
-    ]
+    groups = (claims[ranges == k].T for k in range(BINS))
+    return [Reliability(float(p.mean()), float(right.mean()), p.size) for p, right in groups if p.size]
 
 
 def imperfect_statistics(scores: Iterable[dict[str, Any]]) -> dict[str, float]:

@@ -186,13 +186,10 @@ def _frfs(measured: FrequencyResponses) -> Parts:
 
 
 def _row(channel: Channel, row: np.ndarray, rate_hz: float) -> tuple[str, ...]:
-    quantity = channel.quantity or "not stated"
-    quantity += f" [{channel.unit}]" if channel.unit else ""
+    quantity = (channel.quantity or "not stated") + (f" [{channel.unit}]" if channel.unit else "")
     numbers = (f"{value:.4g}" for value in (row.min(), row.max(), row.mean(), row.std()))
-    if row.size < 16 * SEGMENTS:
-        return channel.name, quantity, *numbers, ""
-    lines, power = power_spectrum(row, rate_hz)
-    return channel.name, quantity, *numbers, ", ".join(f"{f:.4g}" for f in _strongest(lines, power))
+    peaks = _strongest(*power_spectrum(row, rate_hz)) if row.size >= 16 * SEGMENTS else ()
+    return channel.name, quantity, *numbers, ", ".join(f"{f:.4g}" for f in peaks)
 
 
 def _strongest(lines: np.ndarray, power: np.ndarray) -> Sequence[float]:

@@ -69,22 +69,19 @@ def _figures(found: Redesign) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = [("stable samples", *(f"{p.n_stable} of {p.n_draws}" for p in (old, new)))]
     for r in found.controlled:
         rows.append((f"damping ratio of mode {r + 1} [%]", *(_rounded(100.0 * p.damping[:, r]) for p in (old, new))))
-    each = (
-        ("worst_damping", "least damping ratio of any mode [%]", 100.0),
-        ("controlled_settling", "settling time of the controlled modes [s]", 1.0),
-        ("settling", "of all modes [s]", 1.0),
-        ("peak_force", "peak force [N]", 1.0),
-        ("stroke", "largest displacement at an actuator [m]", 1.0),
-        ("controlled_work", "work in controlled modes, W_C [J]", 1.0),
-        ("residual_work", "in residual modes, W_R [J]", 1.0),
-        ("effort", "effort, ∫ FᵀF dt [N² s]", 1.0),
-    )
-    for name, words, scale in each:
+    rows.append(("least damping ratio of any mode [%]", *(_rounded(100.0 * p.worst_damping) for p in (old, new))))
+    each = {
+        "controlled_settling": "settling time of the controlled modes [s]",
+        "settling": "of all modes [s]",
+        "peak_force": "peak force [N]",
+        "stroke": "largest displacement at an actuator [m]",
+        "controlled_work": "work in controlled modes, W_C [J]",
+        "residual_work": "in residual modes, W_R [J]",
+        "effort": "effort, ∫ FᵀF dt [N² s]",
+    }
+    for name, words in each.items():
         # for a growing motion the value depends on the length of the test
-        cells = [
-            _rounded(scale * getattr(p, name)) if name == "worst_damping" or p.share_stable >= 0.5 else "diverges"
-            for p in (old, new)
-        ]
+        cells = (_rounded(getattr(p, name)) if p.share_stable >= 0.5 else "diverges" for p in (old, new))
         rows.append((found.units.named(words), *cells))
     rows.append(("output uncertainty tolerated (small gain) [%]", *(_margin(p) for p in (old, new))))
     return rows
