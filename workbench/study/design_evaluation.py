@@ -211,11 +211,11 @@ def _instability(modes: Modes, law: Law, through: ModalFilter | None, fastest: f
     found = f"the loop is unstable, with a pole of real part {fastest:+.3g} 1/s"
     if through is None:
         return f"{found}; raise R, or move actuators"
-    told = explain_spillover(modes, filtered(law, through))
-    growing = [str(1 + one.mode) for one in told.shifts if one.closed_pole.real > 0.0]
+    explained = explain_spillover(modes, filtered(law, through))
+    growing = [str(1 + one.mode) for one in explained.shifts if one.closed_pole.real > 0.0]
     if growing:
         found += f": residual mode{'s' * (len(growing) > 1)} {joined_in_words(growing)} grow{'s' * (len(growing) == 1)}"
-    rate = told.reduced_decay_rate
+    rate = explained.reduced_decay_rate
     alone = "stable" if rate > 0.0 else f"not stable either, of decay rate {rate:.3g} 1/s"
     return f"{found}; without residual modes it is {alone}; move or add sensors, or raise R"
 

@@ -71,10 +71,10 @@ def measured_case(
                 f"{path} holds the same measurement as --nominal {nominal}: the model is identified from it, so it"
                 " shows no gap; give --nominal a record at low level, and --records and --validation others"
             )
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         rig = rig_from(identify_driven([low]), driving_point=pair)
-    for each in told:
+    for each in caught:
         unscaled = str(each.message).startswith(UNSCALED)
         warnings.warn(f"{UNSCALED}, {NO_SCALE}" if unscaled else str(each.message), each.category, stacklevel=2)
     return Case(nominal.stem, rig, read_all[: len(records)], read_all[len(records) :])

@@ -87,7 +87,8 @@ def save(rig: Rig, structure: str, design: Design, name: str, folder: Path) -> P
         motion=motion,
     )
     if isinstance(domain, NamedPoints):
-        write_points(path.with_suffix(".csv"), domain, rig.modes.phi(domain.names))
         structure = TABLE.sub(rf'\1points = "{path.with_suffix(".csv").name}"', structure)
     write_whole(path.with_suffix(".toml"), structure)
+    if isinstance(domain, NamedPoints):
+        write_points(path.with_suffix(".csv"), domain, rig.modes.phi(domain.names))
     return write_whole(path, script)

@@ -14,7 +14,7 @@ from workbench.cases.case import Case, read_case
 from workbench.cases.writing import write_case
 from workbench.gap.diagnose_case import diagnose_case
 from workbench.renamed import Renamed
-from workbench.trials.imperfections import CLEAN, IMPERFECTIONS, MIMICS, SIZES, TRIPLE
+from workbench.trials.imperfections import CLEAN, IMPERFECTIONS, INDISTINGUISHABLE, SIZES, TRIPLE
 from workbench.trials.make import KINDS, OUTSIDE_KINDS, check_kinds, find_trial_with_plant
 from workbench.trials.rigs import FRAMES, MEMBERS, PLATES
 from workbench.trials.scoring import Statistics, score, score_imperfect, statistics
@@ -78,7 +78,7 @@ def draw_imperfect_kinds(
     drawn: list[ImperfectDraw] = []
     for i in range(n):
         turn, name = i // len(classes), classes[i % len(classes)]
-        pool = [k for k in COMMON_KINDS if k not in MIMICS[name]]
+        pool = [k for k in COMMON_KINDS if k not in INDISTINGUISHABLE[name]]
         if name == TRIPLE:
             kinds = tuple(sorted(_draw_several(3, pool, rng)))
         else:
@@ -135,7 +135,7 @@ def write_trials(
     labelled = {}
     for i, draw in enumerate(draws):
         name, rng = f"case-{i + 1:03d}", np.random.default_rng([seed, i])
-        barred = MIMICS[draw.imperfections] | NOT_ON[structure] | {"truncated_modes"}
+        barred = INDISTINGUISHABLE[draw.imperfections] | NOT_ON[structure] | {"truncated_modes"}
         how = {"others": [k for k in COMMON_KINDS if k not in barred], "tries": MOST_SEEDS, **draw._asdict()}
         case, labelled[name], _ = find_trial_with_plant(rng, like=like, structure=structure, name=name, **how)
         write_case(case, folder / name)
@@ -197,10 +197,10 @@ def hold_trials(
             verdicts[folder.name] = diagnose_case(folder)
             report(f"diagnosed {folder.name}", 0.1 + 0.9 * (i + 1) / n)
         for folder in folders:
-            told, domain = (verdicts[folder.name], labels[folder.name]), read_case(folder).rig.modes.domain
-            scores[folder.name] = score(*told, domain=domain)
+            pair, domain = (verdicts[folder.name], labels[folder.name]), read_case(folder).rig.modes.domain
+            scores[folder.name] = score(*pair, domain=domain)
             if hidden.get("imperfections") is not None:
-                imperfect[folder.name] = score_imperfect(*told, domain=domain)
+                imperfect[folder.name] = score_imperfect(*pair, domain=domain)
     return Trials(verdicts, labels, scores, imperfect, statistics(scores.values()))
 
 

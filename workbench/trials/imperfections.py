@@ -29,7 +29,7 @@ CALIBRATION = 0.01  # standard deviation of the gain of each actuator and each s
 PLACED = 0.002  # standard deviation of the place of each, in each coordinate, over the extent: 4 mm of 2 m
 
 # Effects that cannot be distinguished from the imperfections of a class.
-MIMICS: dict[str, frozenset[str]] = {
+INDISTINGUISHABLE: dict[str, frozenset[str]] = {
     CLEAN: frozenset(),
     "shape": frozenset({"modulus_error", "modal_damping", "axial_load", "truncated_modes"}),
     "offset": frozenset({"modulus_error", "modal_damping", "stiffness_drift"}),
@@ -41,7 +41,7 @@ MIMICS: dict[str, frozenset[str]] = {
     "place": frozenset({"actuator_misplacement", "sensor_misplacement"}),
     TRIPLE: frozenset(),
 }
-MIMICS["mixed"] = frozenset().union(*(MIMICS[name] for name in MIXED))
+INDISTINGUISHABLE["mixed"] = frozenset().union(*(INDISTINGUISHABLE[name] for name in MIXED))
 
 
 def with_imperfections(plant: Plant, name: str, size: float, bench: Bench, rng: np.random.Generator) -> Plant:
