@@ -144,11 +144,7 @@ def _coherence(ax: Axes, record: Record) -> None:
 
 
 def plot_frf(record: Record) -> Figure:
-    """Frequency response of each output to the single input, H1 = S_uy / S_uu, and its coherence.
-
-    Raises:
-        ValueError: a record with no input, or several.
-    """
+    """Frequency response of each output to the single input, H1 = S_uy / S_uu, and its coherence."""
     found = frequency_response(record)
     figure, axes = new_figure(2, 1, width=9, height=5.5, sharex=True, height_ratios=(3, 1))
     for channel, row, dashes in zip(found.output_channels, found.values[:, 0], DASHES, strict=False):

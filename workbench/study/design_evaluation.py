@@ -143,11 +143,7 @@ def start(rig: Rig) -> Design:
 
 
 def _domain(rig: Rig) -> Domain:
-    """The domain in which actuators can be moved.
-
-    Raises:
-        StudyError: points without positions, or modes of an unknown structure.
-    """
+    """The domain in which actuators can be moved."""
     domain, kinds = rig.modes.domain, "a beam, a rod or a plate"
     if isinstance(domain, NamedPoints) and domain.positions is None:
         wanted = f"give them in a table of points, or describe the structure as {kinds}"
@@ -310,11 +306,7 @@ def _frame(rig: Rig, domain: NamedPoints) -> dict[str, Any]:
 
 
 def read_structure(path: Path | None) -> tuple[Rig, str, Units]:
-    """The rig of a TOML file or case folder, with the TOML text and its units; unless given, the dissertation's beam.
-
-    Raises:
-        CaseError: naming the file, the key, the value, and what would be right.
-    """
+    """The rig of a TOML file or case folder, with the TOML text and its units; the beam of the dissertation if None."""
     path = Path(__file__).with_name("assets") / "bench.toml" if path is None else path
     path = path / "case.toml" if path.is_dir() else path
     return read_rig(path), path.read_text(encoding="utf-8"), read_units(path)

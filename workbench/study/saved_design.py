@@ -70,11 +70,7 @@ from workbench.draw.motion import mode_motion""",
 
 
 def save(rig: Rig, structure: str, design: Design, name: str, folder: Path) -> Path:
-    """Write a design as a study: folder/name.py, and the structure (TOML, and a table of named points) beside it.
-
-    Raises:
-        StudyError: an invalid name, or one that is taken.
-    """
+    """Write a design as a study: folder/name.py, and the structure (TOML, and a table of named points) beside it."""
     path, domain = free_path(name, folder), rig.modes.domain
     tried = try_out(rig, design)
     imports, motion = PLATE if isinstance(domain, Rectangle) else FRAME if isinstance(domain, NamedPoints) else MEMBER

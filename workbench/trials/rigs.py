@@ -26,11 +26,7 @@ PARTS = 6  # elements of a column or a floor; every other node is a named point
 
 
 def draw_rig(rng: np.random.Generator, structure: str) -> tuple[Rig, Frame | None]:
-    """A random nominal rig with noise-free sensors, and for a frame the function of its matrices.
-
-    Raises:
-        ValueError: a structure not in `STRUCTURES`.
-    """
+    """A random nominal rig with noise-free sensors, and for a frame the function of its matrices."""
     if structure not in STRUCTURES:
         raise ValueError(f"trials are made on {', '.join(STRUCTURES)}; got {structure!r}")
     if structure == FRAMES:
