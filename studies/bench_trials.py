@@ -8,7 +8,7 @@ from pathlib import Path
 
 from workbench.draw.trials import plot_confusion
 from workbench.trials.hold import RARE_KINDS, draw_kinds, hold_one, processor_times
-from workbench.trials.scoring import tally
+from workbench.trials.scoring import statistics
 
 SINGLES, PAIRS, QUIET, SEED = 13, 4, 4, 985311  # of each structure
 
@@ -34,8 +34,10 @@ def study(outcome, data: Path | None = None) -> None:
             outcome.say(f"{where}: true {result['score']['hidden']}, diagnosed {result['score']['diagnosed']}")
     outcome.table("scores", {f"{r['structure']} {r['seed']}": r["score"] for r in held})
     for structure in ("plates", "frames"):
-        outcome.table(f"shares on {structure}", tally(r["score"] for r in held if r["structure"] == structure).shares)
-    whole = tally(r["score"] for r in held)
+        outcome.table(
+            f"shares on {structure}", statistics(r["score"] for r in held if r["structure"] == structure).shares
+        )
+    whole = statistics(r["score"] for r in held)
     outcome.table("shares", whole.shares)
     for family in whole.shares:
         times = processor_times(r for r in held if r["score"]["family"] == family)

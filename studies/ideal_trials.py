@@ -4,7 +4,7 @@ from pathlib import Path
 
 from workbench.draw.trials import plot_confusion
 from workbench.trials.hold import draw_kinds, hold_one, processor_times
-from workbench.trials.scoring import tally
+from workbench.trials.scoring import statistics
 
 CASES, SEED = 200, 845211
 
@@ -13,7 +13,7 @@ def study(outcome, data: Path | None = None) -> None:
     hidden = draw_kinds(CASES, SEED)
     found = outcome.run([{"kinds": list(kinds), "seed": SEED + i} for i, kinds in enumerate(hidden)], hold_one)
     scores = [result["score"] for result in found if result.error is None]
-    held = tally(scores)
+    held = statistics(scores)
     for result in found:
         if result.error is not None:
             outcome.say(f"seed {result['seed']}: {result.error}")

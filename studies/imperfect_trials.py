@@ -8,7 +8,7 @@ from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.structure.printed import counted
 from workbench.trials.hold import draw_imperfect_kinds, hold_one, processor_times
 from workbench.trials.imperfections import CLEAN, IMPERFECTIONS, SIZES, TRIPLE
-from workbench.trials.scoring import NONE, reliability, tally_imperfect
+from workbench.trials.scoring import NONE, imperfect_statistics, reliability
 
 CASES, SEED = 300, 20420777
 FEW = 10  # claims: a share of fewer is chance
@@ -92,13 +92,13 @@ def study(outcome, data: Path | None = None) -> None:
                 f"seed {result['seed']}, {score['class']}: true {score['hidden']}, diagnosed {score['diagnosed']}"
             )
     outcome.table("scores", {result["seed"]: result["score"] for result in held})
-    by_class = {name: tally_imperfect(s for s in scores if s["class"] == name) for name in IMPERFECTIONS}
-    by_size = {size: tally_imperfect(s for s in scores if s["size"] == size) for size in SIZES}
+    by_class = {name: imperfect_statistics(s for s in scores if s["class"] == name) for name in IMPERFECTIONS}
+    by_size = {size: imperfect_statistics(s for s in scores if s["size"] == size) for size in SIZES}
     outcome.table("by class", by_class)
     outcome.table("by size", by_size)
     outcome.table("processor time, s", processor_times(held))
 
-    whole = tally_imperfect(scores)
+    whole = imperfect_statistics(scores)
     quiet = sum(score["hidden"] == NONE for score in scores)
     outcome.check(f"trials of {CASES} that ended in an error", len(found) - len(held) - len(unsuited), 0)
     outcome.check("share named", whole["named"], 0.9, at_least=True)

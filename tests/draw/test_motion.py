@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from workbench.design.loop.closed_loop import Response
-from workbench.draw.motion import SWAY, frame_net, mode_motion, response_motion
+from workbench.draw.motion import SWAY, frame_wireframe, mode_motion, response_motion
 from workbench.rig.actuators import Actuator
 from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.member import Beam
@@ -78,7 +78,7 @@ def test_a_frame_moves_each_node_in_its_directions_and_closes_its_loop():
 def test_the_feet_of_a_portal_are_not_joined():
     at = np.array([(0, 0, 0), (0, 0, 1), (0, 0, 2), (1, 0, 2), (2, 0, 2), (2, 0, 1), (2, 0, 0)], float)
     portal = NamedPoints(tuple("abcdefg"), at, ("x",) * 7)
-    assert sorted(frame_net(portal).lines) == [[i, i + 1] for i in range(6)]
+    assert sorted(frame_wireframe(portal).lines) == [[i, i + 1] for i in range(6)]
 
 
 def test_sampled_modes_of_a_plate_move_over_it_each_sensor_with_its_phase():

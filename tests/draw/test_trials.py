@@ -5,7 +5,7 @@ import re
 import pytest
 
 from workbench.draw.trials import plot_confusion
-from workbench.trials.scoring import Tally
+from workbench.trials.scoring import Statistics
 
 
 @pytest.mark.parametrize(("n_kinds", "columns"), [(4, 1), (40, 2)])
@@ -14,7 +14,7 @@ def test_each_effect_has_a_row_with_the_cases_that_are_named(n_kinds, columns):
     pairs = {("kind_1 + kind_2", "kind_1"): 3, ("kind_1 + kind_3", "kind_1 + kind_3"): 5}
     counts = right | pairs | {("bouc_wen", "kind_0"): 1, ("kind_0", "kind_1"): 1, ("none", "none"): 4}
     of = sum(counts.values())
-    figure = plot_confusion(Tally(counts, {"single": (2 * n_kinds, 2 * n_kinds + 2), "pair": (5, 8)}, 0, 0))
+    figure = plot_confusion(Statistics(counts, {"single": (2 * n_kinds, 2 * n_kinds + 2), "pair": (5, 8)}, 0, 0))
     assert len(figure.axes) == columns
     rows = [label.get_text() for ax in figure.axes for label in ax.get_yticklabels()]
     kinds = sorted(f"kind {i}" for i in range(n_kinds))

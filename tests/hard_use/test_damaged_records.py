@@ -13,7 +13,7 @@ from workbench.cli.app import app
 from workbench.records.files import read_record, write_record
 from workbench.records.limits import ReadLimits, RecordFileError
 from workbench.records.record import Channel, Record
-from workbench.study.pages.look import look_at
+from workbench.study.pages.look import file_report
 
 ENDINGS = (".csv", ".npz", ".mat", ".h5", ".uff")
 LONGEST, MOST = 10.0, 2 * 2**20  # s; KiB, as the system counts
@@ -318,7 +318,7 @@ def test_thousands_of_channels_are_seen_in_seconds(tmp_path, ending):
     else:
         SAVE[ending](path, t=0.1 * np.arange(10), **signals)
     start = spent()
-    seen = look_at(read_record(path), path)
+    seen = file_report(read_record(path), path)
     assert spent() - start < LONGEST and peak_kib() < MOST
     assert f"{len(signals)} outputs" in seen.heading and len(seen.rows) == 100
 

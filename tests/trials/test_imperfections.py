@@ -16,10 +16,10 @@ from workbench.structure.profile import Profile
 from workbench.trials.benches import draw_bench
 from workbench.trials.finite_elements import Alterations, element_modes
 from workbench.trials.hold import ALIKE, draw_imperfect_kinds
-from workbench.trials.imperfections import IMPERFECTIONS, MIMICS, SIZES, with_imperfections
+from workbench.trials.imperfections import IMPERFECTIONS, INDISTINGUISHABLE, SIZES, with_imperfections
 from workbench.trials.make import make_trial
 from workbench.trials.plant import Plant
-from workbench.trials.scoring import reliability, score_imperfect, tally_imperfect
+from workbench.trials.scoring import imperfect_statistics, reliability, score_imperfect
 
 
 @pytest.fixture(scope="module")
@@ -192,7 +192,7 @@ def test_a_strong_effect_hides_in_every_class_and_nothing_in_every_third():
         assert {draw.size for draw in of_class} == set(SIZES)
         hidden = {len(draw.kinds) for draw in of_class}
         assert hidden == ({3} if name == "triple" else {0, 1})
-        assert not any(set(draw.kinds) & MIMICS[name] for draw in of_class)
+        assert not any(set(draw.kinds) & INDISTINGUISHABLE[name] for draw in of_class)
         assert not any(len(alike & set(draw.kinds)) > 1 for draw in of_class for alike in ALIKE)
     assert sum(not draw.kinds for draw in drawn) == 30
 
@@ -253,7 +253,7 @@ def test_two_of_three_count_where_the_budget_says_that_something_is_left():
 def test_shares_are_of_what_there_is_to_count():
     right = score_imperfect({"effects": [TOLD], "budget": {"unexplained": 0.2}}, LABEL, domain=10.0)
     silent = score_imperfect({"effects": []}, LABEL, domain=10.0)
-    counted = tally_imperfect([right, silent])
+    counted = imperfect_statistics([right, silent])
     assert counted["named"] == 0.5 and counted["wrong"] == 0.0 and counted["false_alarms"] == 0
     assert counted["covered"] == pytest.approx(2 / 3) and counted["honest"] == 0.0 and counted["placed"] == 1.0
 

@@ -21,7 +21,7 @@ from workbench.structure.modes import Modes, PointShapes
 from workbench.trials.hidden import place_of
 from workbench.trials.hold import COMMON_KINDS, RARE_KINDS, draw_kinds, hold_trials, write_trials
 from workbench.trials.make import KINDS, OUTSIDE_KINDS, make_trial
-from workbench.trials.scoring import score, tally
+from workbench.trials.scoring import score, statistics
 
 QUICK = (
     (6, ("clearance",)),  # on a beam
@@ -218,7 +218,7 @@ def test_the_labels_are_gone_from_the_disk_when_a_diagnosis_runs(tmp_path, monke
 
     held = hold_trials(2, 2, kinds=[("sensor_gain",), ()], diagnose_case=guess)
     assert len(seen) == 2
-    assert held.tally.shares == {"single": (1, 1), "none": (0, 1)}
+    assert held.statistics.shares == {"single": (1, 1), "none": (0, 1)}
     assert held.scores["case-001"]["kinds"] and not held.scores["case-001"]["channels"]
 
 
@@ -260,7 +260,7 @@ def test_silence_is_right_only_where_nothing_hides():
     cases = [(silent, none), (silent, bias), (baffled, unknown), (baffled, bias), (silent, unknown)]
     scores = [score(verdict, label, domain=1.0) for verdict, label in cases]
     assert [s["kinds"] for s in scores] == [True, False, True, False, False]
-    counted = tally(scores)
+    counted = statistics(scores)
     assert counted.shares == {"single": (0, 2), "none": (1, 1), "unknown": (1, 2)}
     assert counted.counts["sensor_bias", "none"] == 1 and counted.counts["none", "none"] == 1
 
@@ -298,8 +298,8 @@ def test_cross_talk_between_actuators_is_named(seed):
 )
 def test_a_small_blind_trial_is_passed(kinds):
     held = hold_trials(len(kinds), 314, kinds=kinds)
-    assert all(s["kinds"] for s in held.scores.values()), held.tally.counts
-    assert held.tally.misplaced == 0
+    assert all(s["kinds"] for s in held.scores.values()), held.statistics.counts
+    assert held.statistics.misplaced == 0
 
 
 def test_no_gain_of_a_sensor_looks_like_another_unit():

@@ -17,7 +17,8 @@ from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import Between, NamedPoints, Patch, Rectangle
 from workbench.structure.member import Beam
 from workbench.structure.plate import Plate
-from workbench.trials.benches import Scene, draw_bench, experiments
+from workbench.trials.benches import draw_bench, experiments
+from workbench.trials.draws import NominalMotion
 from workbench.trials.finite_elements import Alterations, element_modes, matrix_modes
 from workbench.trials.hidden import place_of
 from workbench.trials.hold import NOT_ON, draw_kinds, hold_trials
@@ -204,8 +205,8 @@ def test_nothing_hides_where_another_place_moves_alike():
     """The two upper corners of a storey sway as one: along x, no answer could tell them apart."""
     rng = np.random.default_rng(3)
     bench = draw_bench(rng, "frames")
-    scene = Scene.of(bench, experiments(bench, rng)["mid"])
-    drawn = [scene.place(rng, between=i % 2 == 1) for i in range(40)]
+    nominal = NominalMotion.of(bench, experiments(bench, rng)["mid"])
+    drawn = [nominal.place(rng, between=i % 2 == 1) for i in range(40)]
     assert any(isinstance(place, Between) for place in drawn) and len(set(map(str, drawn))) > 3
     corners = {f"{side}{k}.6.x" for side in "LR" for k in (1, 2, 3)}
     assert not corners & {place for place in drawn if isinstance(place, str)}
@@ -240,8 +241,8 @@ def test_places_on_plates_count_by_the_diagonal_and_names_by_themselves():
 @pytest.mark.parametrize("structure", ["plates", "frames"])
 def test_a_small_blind_trial_is_passed(structure):
     held = hold_trials(3, 271, structure=structure, kinds=[("point_damper",), (), ("actuator_gain", "clearance")])
-    assert all(s["kinds"] for s in held.scores.values()), held.tally.counts
-    assert held.tally.misplaced == 0
+    assert all(s["kinds"] for s in held.scores.values()), held.statistics.counts
+    assert held.statistics.misplaced == 0
 
 
 @pytest.mark.slow

@@ -26,14 +26,14 @@ def look(
     """
     from workbench.records.files import named_by_file, read_measured
     from workbench.records.limits import ReadLimits
-    from workbench.study.pages.look import HEADINGS, look_at
+    from workbench.study.pages.look import HEADINGS, file_report
     from workbench.study.pages.page import write_page
 
     check_target(page=page)
     measured = read_measured(
         file, sample_rate_hz=sample_rate_hz, inputs=names_in(inputs), limits=ReadLimits.of_gib(memory)
     )
-    seen = look_at(named_by_file(measured, file), file)
+    seen = file_report(named_by_file(measured, file), file)
     shown = replace(seen.page_content, made_by=as_typed())
     say(seen.heading, bold=True)
     show_table(HEADINGS, seen.rows, right=HEADINGS[2:])

@@ -33,13 +33,13 @@ def trial(
     found = read_case(case)
     with reporting("making cases") as report:
         held = hold_trials(cases, seed, like=found, report=report)
-    for family, (right, of) in held.tally.shares.items():
+    for family, (right, of) in held.statistics.shares.items():
         say(f"  {family:<8} {right} of {of} named correctly")
-    say(f"  places   {held.tally.misplaced} of {held.tally.placed} more than 2 % of the length off")
+    say(f"  places   {held.statistics.misplaced} of {held.statistics.placed} more than 2 % of the length off")
     for name, one in held.scores.items():
         if not one["kinds"]:
             say(f"  {name}: true {one['hidden']}, diagnosed {one['diagnosed']}")
     picture.parent.mkdir(parents=True, exist_ok=True)
-    plot_confusion(held.tally).savefig(picture)
+    plot_confusion(held.statistics).savefig(picture)
     write_json(json_path, {"labels": held.labels, "verdicts": held.verdicts, "scores": held.scores})
     say(f"  figure   {short(picture)}")

@@ -19,14 +19,12 @@ MOST_INSTANTS = 700  # drawn over time, about the number of pixel columns
 def plot_motion(responses: Mapping[str, Response], x: np.ndarray) -> Figure:
     """Displacement over place and time as colour, one panel per response, with a common scale."""
     figure, axes = new_figure(len(responses), 1, width=9, height=2.1 * len(responses), sharex=True, squeeze=False)
-    steps = {name: -(-response.time.size // MOST_INSTANTS) for name, response in responses.items()}
-    fields = {name: response.displacement(x)[:, :: steps[name]] for name, response in responses.items()}
-    limit = max(np.abs(field).max() for field in fields.values())
-    for ax, (name, field) in zip(axes[:, 0], fields.items(), strict=True):
-        time = responses[name].time[:: steps[name]]
-        image = ax.pcolormesh(
-            time, x, field, cmap="RdBu_r", vmin=-limit, vmax=limit, shading="gouraud", rasterized=True
-        )
+    steps = [-(-response.time.size // MOST_INSTANTS) for response in responses.values()]
+    fields = [response.displacement(x)[:, ::step] for response, step in zip(responses.values(), steps)]
+    limit = max(np.abs(field).max() for field in fields)
+    look = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit, "shading": "gouraud", "rasterized": True}
+    for ax, (name, response), field, step in zip(axes[:, 0], responses.items(), fields, steps, strict=True):
+        image = ax.pcolormesh(response.time[::step], x, field, **look)
         ax.set(ylabel="x [m]", title=name)
         ax.grid(False)
     axes[-1, 0].set_xlabel("time [s]")
@@ -40,7 +38,6 @@ def plot_work_linear(works: Mapping[str, np.ndarray], *, first: int, units: Unit
     Args:
         works: (n_residual,) J, by the name of the design.
         first: zero-based index of the first residual mode.
-        units: of the axis.
     """
     figure, ax = new_figure(width=9, height=4)
     shifts, width = grouped_bars(len(works))
@@ -110,11 +107,10 @@ def plot_spillover_paths(explained: Explanation) -> Figure:
     if not explained.shifts:
         return _without_residual_modes()
     figure, axes = new_figure(1, 2, width=11, height=4.5, width_ratios=[1, 1.2])
-    moved = sorted(explained.shifts, key=lambda m: m.mode)
-    numbers = [m.mode + 1 for m in moved]
-    growth = np.array([m.closed_pole.real for m in moved])
+    by_mode = sorted(explained.shifts, key=lambda shift: shift.mode)
+    numbers, growth = [shift.mode + 1 for shift in by_mode], [shift.closed_pole.real for shift in by_mode]
     axes[0].bar(numbers, growth, color=[COLOURS[1] if g > 0 else COLOURS[0] for g in growth])
-    before = [m.pole.real for m in moved]
+    before = [shift.pole.real for shift in by_mode]
     axes[0].plot(numbers, before, "_", color=COLOURS[6], markersize=16, mew=2, label="uncontrolled")
     axes[0].axhline(0.0, color=GREY, linewidth=0.8)
     axes[0].set(xlabel="residual mode", ylabel="growth rate Re λ [1/s]", xticks=few_ticks(numbers))

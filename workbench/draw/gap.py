@@ -40,14 +40,12 @@ def plot_responses(rigs: Mapping[str, Rig], records: Sequence[Record], *, time_u
     figure, axes = new_figure(len(records), 1, width=10, height=2.6 * len(records), squeeze=False)
     for ax, record in zip(axes[:, 0], records, strict=True):
         outputs = {name: simulate_record(rig, record) for name, rig in rigs.items()}
-        first = next(iter(outputs.values()))
-        spread = ((record.outputs - first) / record.outputs.std(axis=1, keepdims=True)) ** 2
+        spread = ((record.outputs - next(iter(outputs.values()))) / record.outputs.std(axis=1, keepdims=True)) ** 2
         j = int(spread.mean(axis=1).argmax())
         width = min(record.n_samples, 300)
         smooth = np.convolve(spread[j], np.ones(width), mode="valid")
         piece = slice(int(smooth.argmax()), int(smooth.argmax()) + width)
-        channel = record.output_channels[j]
-        time = record.time[piece]
+        channel, time = record.output_channels[j], record.time[piece]
         ax.plot(time, record.outputs[j, piece], color=COLOURS[6], label="measured", linewidth=5.0, alpha=0.35)
         for (name, values), other, style in zip(outputs.items(), (COLOURS[1], COLOURS[0]), ("--", "-")):
             colour = MODEL_COLOURS.get(name, other)
@@ -164,11 +162,9 @@ def _plot_places(ax: Axes, verdict: Verdict) -> None:
     ax.set(title="place of one unmodelled force" if place.is_single_force else several)
     domain = verdict.nominal.modes.domain
     if isinstance(domain, Rectangle):
-        _map(ax, verdict, domain)
-        return
+        return _map(ax, verdict, domain)
     if isinstance(domain, NamedPoints):
-        _rank(ax, verdict)
-        return
+        return _rank(ax, verdict)
     below, most = _below(place.profile)
     ax.plot(place.places, below, color=COLOURS[3])
     ax.axvline(place.at, color=GREY, linestyle=":", label="most likely position")
@@ -176,8 +172,7 @@ def _plot_places(ax: Axes, verdict: Verdict) -> None:
     for i, at in enumerate(acting):
         ax.axvline(at, color=COLOURS[0], label="" if i else f"{called} effect")
     ax.set(xlabel=f"x [{verdict.units.length}]", ylabel=BELOW, yscale="log", ylim=(1.5 * most, ALIKE / 1.3))
-    ticks = _decades(most)
-    ax.set_yticks(ticks, _numbered(ticks))
+    ax.set_yticks(*_decades(most))
     ax.yaxis.set_minor_locator(NullLocator())
     ax.legend()
 
@@ -193,17 +188,16 @@ def _rank(ax: Axes, verdict: Verdict) -> None:
     colours = [COLOURS[0] if named else COLOURS[3] for named in is_acting]
     # from below the least difference that is drawn: the bars of points that fit alike are short, but seen
     ax.barh(range(len(shown)), below - STUB * ALIKE, left=STUB * ALIKE, height=0.6, color=colours)
-    names = [_short(at) + f" ({called})" * named for at, named in zip(shown, is_acting, strict=True)]
+    names = [_in_words(at) + f" ({called})" * named for at, named in zip(shown, is_acting, strict=True)]
     ax.set_yticks(range(len(shown)), names, fontsize=8)
     ax.invert_yaxis()
-    ticks = _decades(most)
     ax.set(xscale="log", xlim=(STUB * ALIKE, 1.5 * most), xlabel=BELOW)
-    ax.set_xticks(ticks, _numbered(ticks))
+    ax.set_xticks(*_decades(most))
     ax.xaxis.set_minor_locator(NullLocator())
     for i in np.flatnonzero(below <= ALIKE):
         text = "equally likely" if i else "most likely"
         ax.annotate(text, (ALIKE, i), (6, 0), textcoords="offset points", va="center", fontsize=8)
-    unseen = [_short(at) for at in acting if all(separation(at, other) > 0 for other in shown)]
+    unseen = [_in_words(at) for at in acting if all(separation(at, other) > 0 for other in shown)]
     if unseen:
         label = f"{called}, not among these: {', '.join(unseen)}"
         ax.text(1.4 * most, 0, label, ha="right", va="center", fontsize=8)
@@ -225,8 +219,8 @@ def _map(ax: Axes, verdict: Verdict, domain: Rectangle) -> None:
     bar = ax.figure.colorbar(shades, ax=ax, label=BELOW)
     bar.ax.invert_yaxis()
     bar.minorticks_off()
-    ticks = _decades(most)
-    bar.set_ticks(list(ticks), labels=_numbered(ticks))
+    ticks, labels = _decades(most)
+    bar.set_ticks(list(ticks), labels=labels)
     acting, called = _acting(verdict)
     look: Any = {"clip_on": False, "zorder": 3, "path_effects": [withStroke(linewidth=4.5, foreground="white")]}
     ax.plot(*place.at, "+", color=COLOURS[6], markersize=9, markeredgewidth=2, label="most likely position", **look)
@@ -245,19 +239,15 @@ def _below(profile: Floats) -> tuple[Floats, float]:
     return below, max(float(below.max()), 10.0)
 
 
-def _decades(most: float) -> Floats:
-    """Powers of ten from `ALIKE` to `most`, seven or fewer."""
+def _decades(most: float) -> tuple[Floats, list[str]]:
+    """Powers of ten from `ALIKE` to `most`, seven or fewer, and their labels."""
     last = int(np.floor(np.log10(most)))
-    powers = np.arange(0, last + 2, 1 + last // 6)
-    return np.asarray(ALIKE * 10.0**powers, float)
-
-
-def _numbered(ticks: Floats) -> list[str]:
+    ticks = np.asarray(ALIKE * 10.0 ** np.arange(0, last + 2, 1 + last // 6), float)
     numbers = [f"{tick:g}" if tick < 1e5 else f"10{str(round(np.log10(tick))).translate(RAISED)}" for tick in ticks]
-    return [f"≤ {numbers[0]}", *numbers[1:]]
+    return ticks, [f"≤ {numbers[0]}", *numbers[1:]]
 
 
-def _short(where: Location) -> str:
+def _in_words(where: Location) -> str:
     return " to ".join(map(str, where)) if isinstance(where, Between) else str(where)
 
 
@@ -265,7 +255,6 @@ def plot_unmodelled_force(verdict: Verdict, *, length: str | None = None, force:
     """The unmodelled force at its place, with all other effects in the model, over displacement and velocity.
 
     Args:
-        verdict: of the diagnosis.
         length, force: names of units; those of the verdict unless given.
     """
     units = verdict.units
@@ -280,10 +269,8 @@ def plot_unmodelled_force(verdict: Verdict, *, length: str | None = None, force:
     there = verdict.nominal.modes.domain.text(place.at)
     there = there if isinstance(place.at, Between) else f"at {there}"
     step = max(1, place.force.size // 4000)
-    for ax, series, (name, unit) in (
-        (axes[0], place.displacement, ("displacement", length)),
-        (axes[1], place.velocity, ("velocity", f"{length}/{units.time}")),
-    ):
+    for ax, name, unit in zip(axes, ("displacement", "velocity"), (length, f"{length}/{units.time}"), strict=True):
+        series = getattr(place, name)
         ax.plot(series[::step], place.force[::step], ".", color=COLOURS[0], markersize=3, alpha=0.6)
         ax.set_xlabel(f"{name} {there} [{unit}]")
         law = chosen[0].kind.force_laws.get(name) if chosen else None

@@ -54,12 +54,9 @@ def plot_standard_errors(refined: RefinedModes) -> Figure:
     """Relative standard errors of the frequency and damping ratio of each mode."""
     figure, axes = new_figure(2, 1, width=9, height=5, sharex=True)
     modes = np.arange(1, refined.modes.n_modes + 1)
-    relative = (
-        refined.omega_std / refined.modes.omega,
-        refined.zeta_std / np.maximum(np.abs(refined.modes.zeta), 1e-300),
-    )
-    for ax, values, title in zip(axes, relative, ("frequency", "damping ratio")):
-        ax.semilogy(modes, values, "o-")
+    axes[0].semilogy(modes, refined.omega_std / refined.modes.omega, "o-")
+    axes[1].semilogy(modes, refined.zeta_std / np.maximum(np.abs(refined.modes.zeta), 1e-300), "o-")
+    for ax, title in zip(axes, ("frequency", "damping ratio")):
         ax.set(title=title, ylabel="relative standard error")
     axes[1].set(xlabel="mode", xticks=few_ticks(modes))
     return figure
@@ -83,26 +80,22 @@ def plot_mac(values: np.ndarray) -> Figure:
     figure, ax = new_figure(width=side + 0.7, height=side)
     modes = np.arange(1, len(values) + 1)
     image = ax.imshow(values, cmap="Blues", vmin=0.0, vmax=1.0, origin="lower")
-    ax.set_xticks(modes - 1, [str(mode) for mode in modes])
-    ax.set_yticks(modes - 1, [str(mode) for mode in modes])
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_ticks(modes - 1, [str(mode) for mode in modes])
     ax.set(xlabel="mode", ylabel="mode", title="modal assurance criterion")
     ax.grid(False)
     figure.colorbar(image, ax=ax, label="MAC")
-    if len(values) <= MOST_NUMBERED:
-        for (i, j), value in np.ndenumerate(values):
-            colour = "#ffffff" if value > 0.5 else "#1a1a1a"  # on the cell, whatever the page
-            ax.text(
-                j, i, f"{value:.2f}", ha="center", va="center", fontsize=8 if len(values) <= 8 else 6.5, color=colour
-            )
+    size = 8 if len(values) <= 8 else 6.5
+    for (i, j), value in np.ndenumerate(values) if len(values) <= MOST_NUMBERED else ():
+        colour = "#ffffff" if value > 0.5 else "#1a1a1a"  # on the cell, whatever the page
+        ax.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=size, color=colour)
     return figure
 
 
 def plot_bands(bands: Bands, exact: Modes | None = None, positions: Sequence[float] = ()) -> Figure:
     """Each eigenfunction with its confidence band; below, the band and, if `exact` is given, the error of the curve."""
-    n = bands.phi.shape[1]
-    figure, axes = new_figure(
-        2, n, width=max(5.0, 3.2 * n), height=4.8, sharex=True, squeeze=False, height_ratios=(2, 3)
-    )
+    n, shared = bands.phi.shape[1], {"sharex": True, "squeeze": False, "height_ratios": (2, 3)}
+    figure, axes = new_figure(2, n, width=max(5.0, 3.2 * n), height=4.8, **shared)
     for r, (top, bottom) in enumerate(axes.T):
         phi = bands.phi[:, r]
         top.plot(bands.x, phi, color=COLOURS[0])

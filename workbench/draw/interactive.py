@@ -54,9 +54,9 @@ def described(figure: Figure) -> dict[str, Any]:
     figure.draw_without_rendering()
     axes = [ax for ax in figure.axes if ax.get_visible() and not hasattr(ax, "_colorbar")]
     width, height = figure.get_size_inches() * 96
-    starts = {ax: ax.get_subplotspec() for ax in axes}
+    positions = [ax.get_subplotspec() for ax in axes]
     return {
-        "columns": max((s.get_gridspec().ncols for s in starts.values() if s is not None), default=1),
+        "columns": max((position.get_gridspec().ncols for position in positions if position is not None), default=1),
         "width": round(width),
         "panels": [_panel(ax, axes, height) for ax in axes],
         "legend": bool(figure.legends),
@@ -64,15 +64,15 @@ def described(figure: Figure) -> dict[str, Any]:
 
 
 def _panel(ax: Axes, axes: list[Axes], height: float) -> dict[str, Any]:
-    equal = {"equal": True} if ax.get_aspect() == 1.0 else {}  # lengths along both axes to one scale
+    equal = ax.get_aspect() == 1.0
     return {
-        **equal,
+        **({"equal": True} if equal else {}),  # lengths along both axes to one scale
         "title": _text(ax.get_title("left") or ax.get_title()),
         "height": round(ax.get_position().height * height),
         "x": _axis(ax, ax.xaxis, ax.get_shared_x_axes(), axes),
         "y": _axis(ax, ax.yaxis, ax.get_shared_y_axes(), axes),
         "legend": ax.get_legend() is not None,
-        **({"square": True} if ax.images and ax.get_aspect() == 1.0 else {}),
+        **({"square": True} if ax.images and equal else {}),
         "marks": [mark for artist in _artists(ax) for mark in _described(ax, artist)],
     }
 
@@ -156,22 +156,20 @@ def _box(ax: Axes, patch: Rectangle) -> list[float | None]:
 
 
 def _rectangle(ax: Axes, patch: Rectangle) -> list[dict[str, Any]]:
-    faint = to_rgba(patch.get_facecolor())
-    look = {"colours": [to_hex(faint)], "alpha": float(faint[3]), "label": _label(patch)}
-    if faint[3] == 0:
-        look = {"colours": ["none"], "edge": to_hex(patch.get_edgecolor()), "label": _label(patch)}
-    return [{"kind": "bars", "boxes": [_box(ax, patch)], **look}]
+    face = to_rgba(patch.get_facecolor())
+    look: dict[str, Any] = {"colours": [to_hex(face)], "alpha": float(face[3])}
+    if face[3] == 0:
+        look = {"colours": ["none"], "edge": to_hex(patch.get_edgecolor())}
+    return [{"kind": "bars", "boxes": [_box(ax, patch)], "label": _label(patch), **look}]
 
 
 def _points(ax: Axes, points: PathCollection) -> list[dict[str, Any]]:
-    places = np.asarray(np.ma.filled(points.get_offsets(), np.nan), float)
-    x, y = places[:, 0], places[:, 1]
-    faces, sizes = np.atleast_2d(points.get_facecolor()), points.get_sizes()
-    colours = [to_hex(face) for face in faces] or [to_hex(c) for c in np.atleast_2d(points.get_edgecolor())]
-    same = {"colour": colours[0]} if len(colours) <= 1 else {"colours": colours, "colour": colours[0]}
-    size = round(float(np.sqrt(np.mean(sizes))) * POINTS, 2)
-    return [{"kind": "line", "x": all_rounded(x), "y": all_rounded(y), "width": 0, "marker": "o", "size": size, **same,
-             "label": _label(points), "alpha": _alpha(points)}]  # fmt: skip
+    x, y = np.asarray(np.ma.filled(points.get_offsets(), np.nan), float).T
+    faces = np.atleast_2d(points.get_facecolor())
+    colours = [to_hex(c) for c in (faces if len(faces) else np.atleast_2d(points.get_edgecolor()))]
+    look = {"colour": colours[0], **({"colours": colours} if len(colours) > 1 else {}), "alpha": _alpha(points)}
+    look |= {"width": 0, "marker": "o", "size": round(float(np.sqrt(np.mean(points.get_sizes()))) * POINTS, 2)}
+    return [{"kind": "line", "x": all_rounded(x), "y": all_rounded(y), "label": _label(points), **look}]
 
 
 def _areas(ax: Axes, artist: PolyCollection | Polygon) -> list[dict[str, Any]]:
@@ -185,12 +183,10 @@ def _areas(ax: Axes, artist: PolyCollection | Polygon) -> list[dict[str, Any]]:
 
 def _segments(ax: Axes, lines: LineCollection) -> list[dict[str, Any]]:
     gap = np.full((1, 2), np.nan)
-    points = np.concatenate([part for segment in lines.get_segments() for part in (np.asarray(segment), gap)])
-    x, y = points[:, 0], points[:, 1]
-    colour = to_hex(np.atleast_2d(lines.get_color())[0])
-    return [{"kind": "line", "x": all_rounded(x), "y": all_rounded(y), "colour": colour,
-             "width": round(float(np.mean(lines.get_linewidth())) * POINTS, 2), "dash": "", "label": _label(lines),
-             "alpha": _alpha(lines)}]  # fmt: skip
+    x, y = np.concatenate([part for segment in lines.get_segments() for part in (np.asarray(segment), gap)]).T
+    look = {"colour": to_hex(np.atleast_2d(lines.get_color())[0]), "dash": "", "alpha": _alpha(lines)}
+    look |= {"width": round(float(np.mean(lines.get_linewidth())) * POINTS, 2)}
+    return [{"kind": "line", "x": all_rounded(x), "y": all_rounded(y), "label": _label(lines), **look}]
 
 
 def _mesh(ax: Axes, mesh: QuadMesh) -> list[dict[str, Any]]:
@@ -238,8 +234,7 @@ def _words(ax: Axes, text: Text) -> list[dict[str, Any]]:
     if isinstance(text, Annotation):
         at = text.xy
         if text.anncoords == "offset points":
-            shift = text.get_position()
-            transform = text.xycoords
+            shift, transform = text.get_position(), text.xycoords
         elif text.anncoords != "data":
             raise Undescribed("an annotation that is not placed relative to its point")
     x, y = float(ax.convert_xunits(at[0])), float(ax.convert_yunits(at[1]))

@@ -36,15 +36,13 @@ def response_motion(
 
     Args:
         responses: by the displayed name; all with the same time axis and number of modes.
-        actuators, sensors: marked at their places.
         colours: of responses by name; None for the first of several in grey.
         length: the unit of x.
-
     Raises:
         ValueError: different time axes, or named points without positions.
     """
     first = next(iter(responses.values()))
-    if any(r.time.shape != first.time.shape or (r.time != first.time).any() for r in responses.values()):
+    if not all(np.array_equal(r.time, first.time) for r in responses.values()):
         raise ValueError("responses in one animation must have the same time axis; simulate them with one")
     step = -(-first.time.size // MOST_FRAMES)
     modal = [response.modal[: response.modes.n_modes, ::step] for response in responses.values()]
@@ -58,13 +56,13 @@ def response_motion(
         for track, response in zip(tracks, responses.values(), strict=True):
             track["shapes"] = _numbers(response.modes.phi(x))
         return shown | {"x": _numbers(x), "label": f"x [{length}]", **_marked(actuators, sensors, float)}
-    net = _net(first.modes.domain)
-    moves = [net.moves(response.modes) for response in responses.values()]
+    wireframe = _wireframe(first.modes.domain)
+    moves = [wireframe.moves(response.modes) for response in responses.values()]
     largest = max(float(np.abs(moved @ q).max()) for moved, q in zip(moves, modal, strict=True))
     for track, moved in zip(tracks, moves, strict=True):
-        scaled = moved * SWAY * np.ptp(net.rest, axis=0).max() / max(largest, 1e-300)
+        scaled = moved * SWAY * np.ptp(wireframe.rest, axis=0).max() / max(largest, 1e-300)
         track["moves"] = _numbers(np.moveaxis(scaled, 2, 0))
-    return shown | _on_net(net, actuators, sensors)
+    return shown | _on_wireframe(wireframe, actuators, sensors)
 
 
 def mode_motion(
@@ -81,7 +79,6 @@ def mode_motion(
 
     Args:
         modes: by the displayed name.
-        actuators, sensors: marked at their places.
         std: standard errors (n_modes,) of the frequencies, Hz, and of the damping ratios of a set of modes; both are
             displayed to the second digit of their error.
 
@@ -90,9 +87,9 @@ def mode_motion(
     """
     first = next(iter(modes.values()))
     if isinstance(first, SampledModes) and first.on_plate:
-        shown = _modes_on_net(scattered_net(first.positions), modes, actuators, sensors)
+        shown = _modes_on_wireframe(sensor_wireframe(first.positions), modes, actuators, sensors)
     elif isinstance(first, Modes) and not isinstance(first.domain, Interval):
-        shown = _modes_on_net(_net(first.domain), modes, actuators, sensors)
+        shown = _modes_on_wireframe(_wireframe(first.domain), modes, actuators, sensors)
     else:
         shown = _modes_along(modes, actuators, sensors)
     for track in shown["tracks"]:
@@ -110,12 +107,10 @@ def _modes_along(
     modes: Mapping[str, Modes | SampledModes], actuators: Sequence[Actuator], sensors: Sequence[Sensor]
 ) -> dict[str, Any]:
     """Mode shapes along a line, or over the numbers of the sensors."""
-    first = next(iter(modes.values()))
     tracks: list[dict[str, Any]] = []
     for name, found in modes.items():
         if isinstance(found, SampledModes):
-            x = found.positions if found.on_interval else np.arange(1.0, found.n_outputs + 1)
-            shapes = found.shapes
+            x, shapes = found.positions if found.on_interval else np.arange(1.0, found.n_outputs + 1), found.shapes
         else:
             x = np.linspace(0.0, found.length, N_PLACES)
             shapes = found.phi(x).astype(complex)
@@ -125,30 +120,29 @@ def _modes_along(
             shapes = _aligned(shapes, np.array(tracks[0]["real"]))
         places = {"x": _numbers(x[order]), "sampled": isinstance(found, SampledModes)}
         tracks.append(_track(name, found, **places, real=_numbers(shapes.real), imaginary=_numbers(shapes.imag)))
+    first = next(iter(modes.values()))
     label = "sensor" if isinstance(first, SampledModes) and not first.on_interval else ALONG
-    return {
-        "kind": "modes",
-        "x": tracks[0]["x"],
-        "label": label,
-        "tracks": tracks,
-        **_marked(actuators, sensors, float),
-    }
+    along = {"kind": "modes", "x": tracks[0]["x"], "label": label, "tracks": tracks}
+    return along | _marked(actuators, sensors, float)
 
 
-def _modes_on_net(
-    net: "Net", modes: Mapping[str, Modes | SampledModes], actuators: Sequence[Actuator], sensors: Sequence[Sensor]
+def _modes_on_wireframe(
+    wireframe: "Wireframe",
+    modes: Mapping[str, Modes | SampledModes],
+    actuators: Sequence[Actuator],
+    sensors: Sequence[Sensor],
 ) -> dict[str, Any]:
-    size = np.ptp(net.rest, axis=0).max()
     tracks: list[dict[str, Any]] = []
     for name, found in modes.items():
-        moves = net.moves(found)
+        moves = wireframe.moves(found)
+        size = np.ptp(wireframe.rest, axis=0).max()
         moves = moves * SWAY * size / np.maximum(np.abs(moves).max(axis=(0, 1)), 1e-300)
         if tracks:
             moves = _aligned(moves, np.moveaxis(np.array(tracks[0]["moves"]), 0, 2))
         moves = np.moveaxis(moves, 2, 0)
         phase = {"imaginary": _numbers(moves.imag)} if np.iscomplexobj(moves) else {}
         tracks.append(_track(name, found, moves=_numbers(moves.real), **phase))
-    return {"kind": "modes", "tracks": tracks, **_on_net(net, actuators, sensors)}
+    return {"kind": "modes", "tracks": tracks, **_on_wireframe(wireframe, actuators, sensors)}
 
 
 def _track(name: str, modes: Modes | SampledModes, **shapes: Any) -> dict[str, Any]:
@@ -165,10 +159,10 @@ def _aligned(shapes: np.ndarray, others: np.ndarray) -> np.ndarray:
     return shapes * signs
 
 
-def _on_net(net: "Net", actuators: Sequence[Actuator], sensors: Sequence[Sensor]) -> dict[str, Any]:
-    """A net at rest, and the places of actuators and sensors."""
-    rest = {"net": {"rest": _numbers(net.rest), "lines": net.lines}}
-    return rest | _marked(actuators, sensors, lambda place: _numbers(net.at(place)))
+def _on_wireframe(wireframe: "Wireframe", actuators: Sequence[Actuator], sensors: Sequence[Sensor]) -> dict[str, Any]:
+    """A wireframe at rest, and the places of actuators and sensors."""
+    rest = {"net": {"rest": _numbers(wireframe.rest), "lines": wireframe.lines}}
+    return rest | _marked(actuators, sensors, lambda place: _numbers(wireframe.at(place)))
 
 
 def _marked(
@@ -182,13 +176,13 @@ def _marked(
 
 
 @dataclass(frozen=True, eq=False)
-class Net:
+class Wireframe:
     """Nodes of a structure in a plane projection.
 
     Attributes:
-        rest: (n_spots, 2) projected positions at rest, m.
+        rest: (n_nodes, 2) projected positions at rest, m.
         lines: pairs of nodes joined by a line.
-        moves: modes -> (n_spots, 2, n_modes) projected displacements, complex for sampled modes.
+        moves: modes -> (n_nodes, 2, n_modes) projected displacements, complex for sampled modes.
         at: place -> (2,) projected position of a place, or of the centre of a patch.
     """
 
@@ -203,27 +197,27 @@ def _projected(at: np.ndarray) -> np.ndarray:
     return np.asarray(np.stack([at[..., 0] + 0.4 * at[..., 1], at[..., 2] + 0.45 * at[..., 1]], axis=-1))
 
 
-def _net(domain: Domain) -> Net:
-    return _plate_net(domain) if isinstance(domain, Rectangle) else frame_net(domain)
+def _wireframe(domain: Domain) -> Wireframe:
+    return _plate_wireframe(domain) if isinstance(domain, Rectangle) else frame_wireframe(domain)
 
 
-def _plate_net(domain: Rectangle) -> Net:
+def _plate_wireframe(domain: Rectangle) -> Wireframe:
     sides = domain.length
     n, m = (max(round(PER_SIDE * side / max(sides)), 6) for side in sides)
     x, y = (np.linspace(0.0, side, count) for side, count in zip(sides, (n, m), strict=True))
     places = np.column_stack([np.repeat(x, m), np.tile(y, n)])
     lines = [[i * m + j, i * m + j + 1] for i in range(n) for j in range(m - 1)]
     lines += [[i * m + j, i * m + j + m] for i in range(n - 1) for j in range(m)]
-    return _flat_net(places, lines, lambda modes: modes.phi(places))
+    return _flat_wireframe(places, lines, lambda modes: modes.phi(places))
 
 
-def scattered_net(places: np.ndarray) -> Net:
-    """The net of sensors on a plate, at places (n_sensors, 2), neighbours joined; readings are drawn upwards."""
-    return _flat_net(places, _neighbours(places), lambda modes: modes.shapes)
+def sensor_wireframe(places: np.ndarray) -> Wireframe:
+    """The wireframe of sensors on a plate, at places (n_sensors, 2), neighbours joined; readings are drawn upwards."""
+    return _flat_wireframe(places, _neighbours(places), lambda modes: modes.shapes)
 
 
-def _flat_net(places: np.ndarray, lines: list[list[int]], shapes: Callable[[Any], np.ndarray]) -> Net:
-    """The net of places (n_spots, 2) in the plane z = 0, whose transverse shapes are drawn upwards."""
+def _flat_wireframe(places: np.ndarray, lines: list[list[int]], shapes: Callable[[Any], np.ndarray]) -> Wireframe:
+    """The wireframe of places (n_nodes, 2) in the plane z = 0, whose transverse shapes are drawn upwards."""
 
     def upwards(modes: Modes | SampledModes) -> np.ndarray:
         transverse = shapes(modes)
@@ -232,11 +226,11 @@ def _flat_net(places: np.ndarray, lines: list[list[int]], shapes: Callable[[Any]
     def at(place: Any) -> np.ndarray:
         return _projected(np.r_[np.asarray(place)[:2], 0.0])
 
-    return Net(_projected(np.column_stack([places, np.zeros(len(places))])), lines, upwards, at)
+    return Wireframe(_projected(np.column_stack([places, np.zeros(len(places))])), lines, upwards, at)
 
 
-def frame_net(domain: Domain) -> Net:
-    """The net of a frame, neighbouring nodes joined, in an oblique view; a plane frame is seen from the front.
+def frame_wireframe(domain: Domain) -> Wireframe:
+    """The wireframe of a frame, neighbouring nodes joined, in an oblique view; a plane frame is seen from the front.
 
     Raises:
         ValueError: named points without positions.
@@ -246,8 +240,7 @@ def frame_net(domain: Domain) -> Net:
     names = list(dict.fromkeys(domain.nodes))
     names = names[:: -(-len(names) // MOST_NODES)]
     nodes = {node: i for i, node in enumerate(names)}
-    first = {node: i for i, node in reversed(list(enumerate(domain.nodes)))}
-    at = domain.positions[[first[node] for node in names]]
+    at = domain.positions[[domain.nodes.index(node) for node in names]]
     planar = np.ptp(at[:, 2]) == 0 and "z" not in domain.directions
     see = (lambda at: at[..., :2]) if planar else _projected
 
@@ -263,7 +256,7 @@ def frame_net(domain: Domain) -> Net:
         index = domain.nodes.index(place) if place in domain.nodes else domain.locate(place)[0]
         return see(np.asarray(domain.positions)[index])
 
-    return Net(see(at), _neighbours(at), moves, spot)
+    return Wireframe(see(at), _neighbours(at), moves, spot)
 
 
 def _neighbours(at: np.ndarray) -> list[list[int]]:

@@ -13,7 +13,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.sensor_placement import SensorPlacement
 from workbench.design.placement.task import Placement, PlacementTask, extent
-from workbench.draw.motion import frame_net
+from workbench.draw.motion import frame_wireframe
 from workbench.draw.style import COLOURS, GREY, MOST_TICKS, few_ticks, grouped_bars, new_figure, plain_ticks
 from workbench.draw.surface import draw_moved, draw_nodal_lines, rest_and_moved
 from workbench.records.units import SI, Units
@@ -29,23 +29,8 @@ N_PLACES = 401
 CORNERS = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])  # of a rectangle, anticlockwise
 BELOW: Any = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.14)}
 OTHERS = tuple(colour for i, colour in enumerate(COLOURS) if i not in (1, 4))  # without those of sensors and spillover
-IMPULSE: Any = {
-    "color": COLOURS[4],
-    "label": "impulse",
-    "linestyle": "none",
-    "marker": "*",
-    "markeredgecolor": "black",
-    "markersize": 14,
-}
-SENSOR: Any = {
-    "color": "none",
-    "marker": "o",
-    "markerfacecolor": COLOURS[1],
-    "markeredgecolor": "black",
-    "markersize": 10,
-    "zorder": 3,
-    "clip_on": False,
-}
+IMPULSE: Any = {"color": COLOURS[4], "label": "impulse", "ls": "none", "marker": "*", "mec": "black", "ms": 14}
+SENSOR: Any = dict(color="none", marker="o", mfc=COLOURS[1], mec="black", ms=10, zorder=3, clip_on=False)
 
 
 def plot_placement(placement: Placement, *, units: Units = SI) -> Figure:
@@ -76,13 +61,11 @@ def plot_places(
         length: of the structure, or both sides of the plate, m; None leaves the outline out.
         forbidden: zones without actuators, m.
         impulse_at: place of the impulse, m, marked by a star.
-        units: of the axes.
     """
     zone: Any = {"facecolor": GREY, "alpha": 0.3, "linewidth": 0}
     if next(iter(places.values())).ndim == 2:
         figure, ax = new_figure(width=6, height=5)
-        for i, (low, high) in enumerate(forbidden):
-            corner, opposite = np.array(low, float), np.array(high, float)
+        for i, (corner, opposite) in enumerate(np.array(forbidden, float).reshape(-1, 2, 2)):
             box = corner + 0.5 * (1.0 + CORNERS) * (opposite - corner)
             ax.fill(*box.T, **zone, label="forbidden" if i == 0 else None)
         for (name, positions), marker in zip(places.items(), "osD^v"):
@@ -96,7 +79,7 @@ def plot_places(
         ax.set_aspect("equal")
         ax.legend(**BELOW)
         return figure
-    rows = [*places, *(["impulse"] if impulse_at is not None else [])]
+    rows = [*places, *["impulse"] * (impulse_at is not None)]
     figure, ax = new_figure(width=9, height=1.4 + 0.5 * len(rows))
     for i, (low, high) in enumerate(forbidden):
         ax.axvspan(low, high, **zone, label="forbidden" if i == 0 else None)
@@ -127,7 +110,6 @@ def plot_member_placement(
         placements: by name, each in its own colour and row.
         limits: forbidden zones are hatched.
         impulse_at: place of the impulse, m, marked by a star.
-        units: of the axes.
     """
     n, modes = task.n_controlled, task.modes
     figure, (left, right) = new_figure(1, 2, width=11, height=3.8)
@@ -145,9 +127,7 @@ def plot_member_placement(
         left.plot(impulse_at, 1.2, **IMPULSE)
     left.set(xlabel=units.named("x [m]"), yticks=[], title="positions of the actuators")
     left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), fontsize=9, ncols=2)
-    most, _ = _draw_works(right, task, placements, units)
-    right.set_ylim(SHOWN_SHARE * most, 3.0 * most)
-    _mark_zeros(right)
+    _draw_works(right, task, placements, units)
     return figure
 
 
@@ -168,7 +148,6 @@ def plot_surface_placement(
         placements: by name, each in its own colour.
         limits: forbidden zones are hatched.
         impulse_at: place of the impulse, m, marked by a star.
-        units: of the axes.
     """
     n, modes = task.n_controlled, task.modes
     assert isinstance(modes.domain, Rectangle)
@@ -178,14 +157,8 @@ def plot_surface_placement(
         look = {"facecolor": "white", "edgecolor": GREY, "hatch": "////", "zorder": 2}
         left.fill([x0, x1, x1, x0], [y0, y0, y1, y1], **look, label="forbidden" if i == 0 else None)
     for i, (name, placement) in enumerate(placements.items()):
-        look = {
-            "color": COLOURS[i],
-            "markersize": 10,
-            "label": _with_work(name, placement, units),
-            "zorder": 3,
-            "clip_on": False,
-        }
-        left.plot(*placement.positions.T, "o", **look)
+        look = {"color": COLOURS[i], "markersize": 10, "zorder": 3, "clip_on": False}
+        left.plot(*placement.positions.T, "o", label=_with_work(name, placement, units), **look)
         if isinstance(task.actuator.at, Patch):
             half = 0.5 * np.array(task.actuator.at[2:])
             for middle in placement.positions:
@@ -198,10 +171,7 @@ def plot_surface_placement(
     labels = {"xlabel": units.named("x [m]"), "ylabel": units.named("y [m]")}
     left.set(anchor="N", xticks=(0.0, a), yticks=(0.0, b), **labels)
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower left", fontsize=9, ncols=4)
-    most, least = _draw_works(right, task, placements, units)
-    # a mode with all actuators at its nodes has no work but rounding
-    right.set_ylim(max(SHOWN_WORK * most, 0.3 * least), 3.0 * most)
-    _mark_zeros(right)
+    _draw_works(right, task, placements, units)
     return figure
 
 
@@ -209,10 +179,8 @@ def _with_work(name: str, placement: Placement, units: Units) -> str:
     return f"{name}: W_R = {placement.residual_work:.2g} {units.named('J')}"
 
 
-def _draw_works(
-    ax: Axes, task: PlacementTask, placements: Mapping[str, Placement], units: Units
-) -> tuple[float, float]:
-    """Draw the work in each residual mode, a bar per placement; return the most and the least of them."""
+def _draw_works(ax: Axes, task: PlacementTask, placements: Mapping[str, Placement], units: Units) -> None:
+    """Draw the work in each residual mode, a bar per placement; bars below the logarithmic axis are marked by ≈ 0."""
     numbers = np.arange(task.n_controlled, task.modes.n_modes) + 1
     shifts, width = grouped_bars(len(placements))
     for i, placement in enumerate(placements.values()):
@@ -220,16 +188,12 @@ def _draw_works(
     ax.set(xlabel="residual mode", ylabel=units.named("spillover work, W_r [J]"), xticks=few_ticks(numbers))
     ax.set_yscale("log")
     work = np.concatenate([placement.residual_work_by_mode for placement in placements.values()])
-    return float(work.max()), float(work.min())
-
-
-def _mark_zeros(ax: Axes) -> None:
-    """Mark the bars that end below a logarithmic axis, which are not seen, by ≈ 0."""
-    bottom, bars = ax.get_ylim()[0], [bar for bar in ax.patches if isinstance(bar, Bar)]
-    if len(bars) > MOST_TICKS * len(ax.containers):
-        return
-    for bar in bars:
-        if bar.get_height() < bottom:
+    bottom = SHOWN_SHARE * work.max()
+    if isinstance(task.modes.domain, Rectangle):  # a mode with all actuators at its nodes has no work but rounding
+        bottom = max(SHOWN_WORK * work.max(), 0.3 * work.min())
+    ax.set_ylim(bottom, 3.0 * work.max())
+    for bar in ax.patches if numbers.size <= MOST_TICKS else ():
+        if isinstance(bar, Bar) and bar.get_height() < bottom:
             at = (bar.get_x() + 0.5 * bar.get_width(), 1.2 * bottom)
             ax.text(*at, "≈ 0", ha="center", fontsize=8, color=bar.get_facecolor())
 
@@ -257,13 +221,10 @@ def plot_sensor_placement(placement: SensorPlacement) -> Figure:
         else:
             _along(left, placement)
     _errors(right, placement)
-    even = (
-        f", evenly spaced {100 * placement.evenly_spaced_error:.2g} %"
-        if np.isfinite(placement.evenly_spaced_error)
-        else ""
-    )
     found = f"error of the modal coordinates {100 * placement.error:.2g} %"
-    figure.suptitle(f"{counted(len(placement.positions), 'sensor')} placed: {found}{even}", x=0.01, ha="left")
+    if np.isfinite(placement.evenly_spaced_error):
+        found += f", evenly spaced {100 * placement.evenly_spaced_error:.2g} %"
+    figure.suptitle(f"{counted(len(placement.positions), 'sensor')} placed: {found}", x=0.01, ha="left")
     return plain_ticks(figure)
 
 
@@ -290,11 +251,11 @@ def _along(ax: Axes, placement: SensorPlacement) -> None:
 
 def _at_points(ax: Axes, placement: SensorPlacement) -> None:
     shown, called = _lowest_residual(placement)
-    net = frame_net(placement.modes.domain)
-    draw_moved(ax, net, net.moves(placement.modes)[:, :, shown])
+    wireframe = frame_wireframe(placement.modes.domain)
+    draw_moved(ax, wireframe, wireframe.moves(placement.modes)[:, :, shown])
     names: dict[tuple[float, ...], list[str]] = {}
     for name in placement.places:
-        names.setdefault(tuple(net.at(name)), []).append(str(name))
+        names.setdefault(tuple(wireframe.at(name)), []).append(str(name))
     for at, here in names.items():
         ax.plot(*at, **SENSOR)
         ax.annotate(", ".join(here), (at[0], at[1]), (-9, 5), textcoords="offset points", ha="right")
@@ -310,10 +271,8 @@ def _legend(ax: Axes, *handles: Line2D) -> None:
 def _errors(ax: Axes, placement: SensorPlacement) -> None:
     errors = 100.0 * np.sqrt(placement.by_mode)
     controlled = np.isin(np.arange(errors.size), placement.controlled)
-    for which, colour, label in (
-        (controlled, COLOURS[0], "controlled: estimation error"),
-        (~controlled, COLOURS[4], "residual: observation spillover"),
-    ):
+    labels = "controlled: estimation error", "residual: observation spillover"
+    for which, colour, label in zip((controlled, ~controlled), (COLOURS[0], COLOURS[4]), labels):
         ax.bar(1 + np.flatnonzero(which), errors[which], color=colour, label=label)
     most = max(errors.max(), 1e-12)
     ax.set(yscale="log", ylim=(max(SHOWN_ERROR * most, 0.3 * errors.min()), 3.0 * most))

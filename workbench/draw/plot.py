@@ -63,9 +63,8 @@ def _(result: Modes) -> Figure:
     if isinstance(result.domain, NamedPoints):
         return plot_point_modes(result, count=MOST_PANELS)
     x = np.linspace(0.0, result.length, 401)
-    shapes = result.phi(x)
     figure, axes = _panel_per_mode(result, "x [m]")
-    for ax, shape in zip(axes, shapes.T):
+    for ax, shape in zip(axes, result.phi(x).T):
         ax.plot(x, shape)
     axes[0].set_ylabel("φ(x) [1/√kg]")
     return figure
@@ -84,6 +83,7 @@ def _(result: SampledModes) -> Figure:
     return figure
 
 
+DISTURBANCE = "residual energy after this disturbance"
 plot.register(Record, plot_record)
 plot.register(FrequencyResponses, plot_frf_matrix)
 plot.register(RefinedModes, plot_standard_errors)
@@ -96,9 +96,7 @@ plot.register(SensorPlacement, plot_sensor_placement)
 plot.register(ModalEstimates, lambda result: plot(result.modes))
 plot.register(Bands, lambda result: plot_surface_bands(result) if result.x.ndim == 2 else plot_bands(result))
 plot.register(Spillover, lambda result: plot_work({"this design": result}))
-plot.register(
-    ControlledModeCount, lambda result: plot_controlled_mode_count({"residual energy after this disturbance": result})
-)
+plot.register(ControlledModeCount, lambda result: plot_controlled_mode_count({DISTURBANCE: result}))
 plot.register(Distortion, lambda result: plot_distortion([result]))
 
 
@@ -131,8 +129,7 @@ def _panel_per_mode(modes: Modes | SampledModes, label: str) -> tuple[Figure, li
     figure, axes = panels(min(modes.n_modes, MOST_PANELS), 3, width=10, row_height=2.1, margin=0.6, sharex=True)
     for r, ax in enumerate(axes):
         ax.axhline(0.0, color=GREY, linewidth=0.6)
-        name = f"mode {r + 1}: {modes.frequencies_hz[r]:.4g} Hz, ζ = {100 * modes.zeta[r]:.2g} %"
-        ax.set_title(name, fontsize=10)
+        ax.set_title(f"mode {r + 1}: {modes.frequencies_hz[r]:.4g} Hz, ζ = {100 * modes.zeta[r]:.2g} %", fontsize=10)
         ax.set_xlabel(label)
     return figure, axes
 
@@ -141,9 +138,8 @@ def _point_motion(result: Response, names: Sequence[str]) -> Figure:
     """Displacement over time of the points of largest motion, one panel per point, with a common scale."""
     moved = result.displacement(list(names))
     most = np.sort(np.argsort(-np.abs(moved).max(axis=1), kind="stable")[:MOST_PANELS])
-    figure, axes = new_figure(
-        len(most), 1, width=9, height=0.8 + 1.0 * len(most), sharex=True, sharey=True, squeeze=False
-    )
+    shared = {"sharex": True, "sharey": True, "squeeze": False}
+    figure, axes = new_figure(len(most), 1, width=9, height=0.8 + 1.0 * len(most), **shared)
     for ax, i in zip(axes[:, 0], most):
         ax.plot(result.time, moved[i], linewidth=0.9)
         ax.set_ylabel(names[i])

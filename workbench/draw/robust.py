@@ -29,9 +29,8 @@ def plot_redesign(result: Redesign) -> Figure:
     for name, verification, colour in both:
         middle, low, high = np.clip(verification.energy / max(top, 1e-300), 1e-9, 1e3)
         left.fill_between(time, low, high, color=colour, alpha=0.25, linewidth=0)
-        left.semilogy(
-            time, middle, color=colour, linewidth=1.2, label=f"{name}: stable on {verification.share_stable:.0%}"
-        )
+        label = f"{name}: stable on {verification.share_stable:.0%}"
+        left.semilogy(time, middle, color=colour, linewidth=1.2, label=label)
     left.axhline(SETTLED, color=GREY, linewidth=0.8)
     left.annotate("settling threshold", (time[-1], SETTLED), (0, 3), textcoords="offset points", fontsize=8, ha="right")
     left.set(xlabel=f"time [{result.units.time}]", ylabel="modal energy over its peak", ylim=(1e-6, 3.0))
@@ -69,11 +68,8 @@ def plot_steps(result: Redesign) -> Figure:
 def plot_prediction(prediction: Prediction, measured: Record | None = None) -> Figure:
     """Two rows per sensor: readings over time and amplitudes of their Fourier transform; both less the prediction.
 
-    The lower row shows the band about zero, which may be far narrower than the readings.
-
-    Args:
-        prediction: with its bands.
-        measured: the record of the test, drawn on top, around the reading farthest outside its band.
+    The lower row shows the band about zero, which may be far narrower than the readings. A measured record is drawn on
+    top, around the reading farthest outside its band.
     """
     shown = min(len(prediction.channels), MOST_SENSORS)
     figure, axes = new_figure(2 * shown, 2, width=11, height=1.2 + 3.2 * shown, sharex="col", squeeze=False)
@@ -82,32 +78,26 @@ def plot_prediction(prediction: Prediction, measured: Record | None = None) -> F
     time, f = prediction.time[piece], prediction.frequencies_hz[1:]
     band = {"color": BAND, "alpha": 0.3, "linewidth": 0, "label": f"{100 * LEVEL:g} % band"}
     line, test = {"color": BAND, "linewidth": 0.9, "label": "predicted"}, {"color": TEST, "linewidth": 0.9}
-    for j in range(shown):
-        (left, right), below = axes[2 * j], axes[2 * j + 1]
-        channel = prediction.channels[j]
+    for j, channel in enumerate(prediction.channels[:shown]):
         reading = rows.get(channel.name)
-        middle, low, high = (y[j, piece] for y in (prediction.median, prediction.lower, prediction.upper))
-        left.fill_between(time, low, high, **band)
-        left.plot(time, middle, **line)
-        below[0].fill_between(time, low - middle, high - middle, **band)
+        readings = [y[j, piece] for y in (prediction.median, prediction.lower, prediction.upper)]
         spectra = prediction.spectrum_median, prediction.spectrum_lower, prediction.spectrum_upper
-        centre, lowest, highest = (spectrum[j, 1:] for spectrum in spectra)
-        least = 1e-3 * highest[highest > 0].min() if (highest > 0).any() else 1e-300
-        right.fill_between(f, np.maximum(lowest, least), np.maximum(highest, least), **band)
-        right.loglog(f, np.maximum(centre, least), **line)
-        below[1].fill_between(f, lowest - centre, highest - centre, **band)
-        if reading is not None:
-            size = amplitudes(reading[None])[0, 1:]
-            left.plot(time, reading[piece], label="measured", **test)
-            right.loglog(f, np.maximum(size, least), label="measured", **test)
-            below[0].plot(time, reading[piece] - middle, label="measured", **test)
-            below[1].plot(f, size - centre, label="measured", **test)
+        sizes = [spectrum[j, 1:] for spectrum in spectra]
+        least = 1e-3 * sizes[2][sizes[2] > 0].min() if (sizes[2] > 0).any() else 1e-300
+        seen = (None, None) if reading is None else (reading[piece], amplitudes(reading[None])[0, 1:])
+        columns = (time, readings, seen[0], -np.inf, channel.name), (f, sizes, seen[1], least, f"|{channel.name}|")
         difference = f"{100 * LEVEL:g} % band about the prediction" if reading is None else "measured − predicted"
-        for ax, under, name in zip((left, right), below, (channel.name, f"|{channel.name}|"), strict=True):
+        for (ax, below), (x, (middle, low, high), found, floor, name) in zip(axes[2 * j : 2 * j + 2].T, columns):
+            ax.fill_between(x, np.maximum(low, floor), np.maximum(high, floor), **band)
+            ax.plot(x, np.maximum(middle, floor), **line)
+            below.fill_between(x, low - middle, high - middle, **band)
+            if found is not None:
+                ax.plot(x, np.maximum(found, floor), label="measured", **test)
+                below.plot(x, found - middle, label="measured", **test)
             ax.set_ylabel(in_units(name, channel.unit))
-            under.axhline(0.0, color=BAND, linewidth=0.9)
-            under.set_ylabel(in_units("difference", channel.unit))
-            under.set_title(f"{name}: {difference}")
+            below.axhline(0.0, color=BAND, linewidth=0.9)
+            below.set(ylabel=in_units("difference", channel.unit), title=f"{name}: {difference}")
+        axes[2 * j, 1].set(xscale="log", yscale="log")
     whole = time.size == prediction.time.size
     axes[0, 0].set_title("readings over time" if whole else "readings near the one farthest outside its band")
     axes[0, 1].set_title("amplitude spectrum of the whole record")

@@ -31,10 +31,6 @@ def power_spectrum(values: np.ndarray, rate_hz: float) -> tuple[np.ndarray, np.n
     """Frequencies, Hz, and power spectral density, (n_lines,) each, of a signal without its mean, by Welch's method.
 
     The segments have 4,096 samples, or a quarter of the signal, and overlap by half.
-
-    Args:
-        values: (n_samples,).
-        rate_hz: sampling rate.
     """
     segment = _segment(values.size)
     step = segment - segment // 2
@@ -81,30 +77,25 @@ def plot_spectra(record: Record) -> Figure:
 
 def _panel_per_signal(record: Record, *, height: float) -> tuple[Figure, list[tuple[Axes, Channel, Floats, str]]]:
     """A figure, and the axes, channel, samples and colour of each signal, inputs first."""
-    signals = [(channel, values, COLOURS[1]) for channel, values in zip(record.input_channels, record.inputs)]
-    signals += [(channel, values, COLOURS[0]) for channel, values in zip(record.output_channels, record.outputs)]
-    signals = signals[:MOST_PANELS]
+    channels, values = (*record.input_channels, *record.output_channels), (*record.inputs, *record.outputs)
+    colours = [COLOURS[1]] * record.n_inputs + [COLOURS[0]] * record.n_outputs
+    signals = [*zip(channels, values, colours)][:MOST_PANELS]
     figure, axes = new_figure(len(signals), 1, width=9, height=0.8 + height * len(signals), sharex=True, squeeze=False)
     return figure, [(ax, *signal) for ax, signal in zip(axes[:, 0], signals)]
 
 
 def plot_frf_matrix(measured: FrequencyResponses, fitted: FrequencyResponses | None = None) -> Figure:
-    """Magnitude and phase of each output's FRFs, all inputs in one panel.
-
-    Args:
-        fitted: FRFs of a model, at any frequencies, drawn dashed.
-    """
+    """Magnitude and phase of each output's FRFs, all inputs in one panel; those of a fitted model are dashed."""
     channels = measured.output_channels[:MOST_PANELS]
     figure, axes = new_figure(len(channels), 2, width=10, height=0.8 + 1.6 * len(channels), sharex=True, squeeze=False)
-    for drawn in (measured, *([fitted] if fitted else [])):
-        how = {"linewidth": 0.9, "linestyle": "-"} if drawn is measured else {"linewidth": 1.2, "linestyle": "--"}
+    styles = [(measured, 0.9, "-", ""), *([(fitted, 1.2, "--", ", fitted")] if fitted else [])]
+    for k, (drawn, width, dashes, suffix) in enumerate(styles):
         for (size, angle), values in zip(axes, drawn.values):
             for i, (reference, row) in enumerate(zip(drawn.references, values, strict=True)):
-                colour = COLOURS[(2 * i + (drawn is not measured)) % len(COLOURS)]
-                label = reference if drawn is measured else f"{reference}, fitted"
+                how = {"color": COLOURS[(2 * i + k) % len(COLOURS)], "linewidth": width, "linestyle": dashes}
                 seen = np.where(np.abs(row) > 0, row, np.nan)
-                size.semilogy(drawn.frequencies_hz, np.abs(seen), color=colour, label=label, **how)
-                angle.plot(drawn.frequencies_hz, np.degrees(np.angle(seen)), color=colour, **how)
+                size.semilogy(drawn.frequencies_hz, np.abs(seen), label=f"{reference}{suffix}", **how)
+                angle.plot(drawn.frequencies_hz, np.degrees(np.angle(seen)), **how)
     for (size, angle), channel in zip(axes, channels, strict=True):
         size.set_ylabel(in_units(f"|{channel.name}|", f"{channel.unit} per input" if channel.unit else ""), fontsize=8)
         angle.set(ylabel="phase [°]", ylim=(-190.0, 190.0), yticks=(-180, -90, 0, 90, 180))
@@ -153,20 +144,14 @@ def _coherence(ax: Axes, record: Record) -> None:
 
 
 def plot_frf(record: Record) -> Figure:
-    """Frequency response of each output to the single input, H1 = S_uy / S_uu, and its coherence.
-
-    Raises:
-        ValueError: a record with no input, or several.
-    """
+    """Frequency response of each output to the single input, H1 = S_uy / S_uu, and its coherence."""
     found = frequency_response(record)
     figure, axes = new_figure(2, 1, width=9, height=5.5, sharex=True, height_ratios=(3, 1))
     for channel, row, dashes in zip(found.output_channels, found.values[:, 0], DASHES, strict=False):
         axes[0].semilogy(found.frequencies_hz, np.abs(row), linewidth=0.9, linestyle=dashes, label=channel.name)
     _coherence(axes[1], record)
     (force,), units = record.input_channels, {channel.unit for channel in record.output_channels}
-    output = units.pop() if len(units) == 1 else ""
-    per_input = f"({output})/{force.unit}" if "/" in output else f"{output}/{force.unit}"
-    label = in_units(f"|output / {force.name}|", per_input if output and force.unit else "")
+    label = in_units(f"|output / {force.name}|", _per_input(units.pop() if len(units) == 1 else "", [force.unit]))
     axes[0].set(ylabel=label, title="frequency response (H1)")
     axes[0].legend(ncols=4, fontsize=8)
     return figure
@@ -175,8 +160,7 @@ def plot_frf(record: Record) -> Figure:
 def plot_frf_of_inputs(found: FrfEstimate, fitted: FrequencyResponses | None = None) -> Figure:
     """Frequency responses to several inputs, a panel per output and a line per input, and the multiple coherence.
 
-    Args:
-        fitted: those of the identified modes, at any frequencies, drawn dashed.
+    Those of the identified modes, at any frequencies, are dashed.
     """
     measured, same = found.frf, len(set(found.units)) == 1
     named = [name if same or not unit else f"{name} [{unit}]" for name, unit in zip(measured.references, found.units)]
@@ -191,11 +175,10 @@ def plot_frf_of_inputs(found: FrfEstimate, fitted: FrequencyResponses | None = N
                 row = fitted.values[fitted.output_names.index(channel.name), fitted.references.index(name)]
                 look = {"color": colour, "linestyle": "--", "linewidth": 1.4}
                 ax.semilogy(fitted.frequencies_hz, _nonzero(row), label=f"{name}, modes", **look)
-        drawn = np.concatenate([_nonzero(row) for row in measured.values[j, :MOST_INPUTS]])
+        drawn = _nonzero(measured.values[j, :MOST_INPUTS])
         if np.isfinite(drawn).any():  # single lines of noise, and zeros of a model, may be far lower
-            ax.set_ylim(
-                0.3 * np.nanquantile(drawn, 0.005), 3.0 * np.nanmax([np.nanmax(drawn), _peak(fitted, channel.name)])
-            )
+            highest = [np.nanmax(drawn), _peak(fitted, channel.name)]
+            ax.set_ylim(0.3 * np.nanquantile(drawn, 0.005), 3.0 * np.nanmax(highest))
         ax.set_ylabel(in_units(f"|{channel.name} / input|", _per_input(channel.unit, found.units)))
     colours = COLOURS[3:] + COLOURS[:3]  # of outputs: those above are of inputs
     for channel, row, colour in zip(channels, found.coherence, colours):
@@ -229,16 +212,14 @@ def _per_input(unit: str, of_inputs: Sequence[str]) -> str:
 def plot_distortion(distortions: Sequence[Distortion]) -> Figure:
     """Excited lines, odd and even lines that are not excited, and noise; a column per record, a row per output."""
     rows = distortions[0].channels[:OUTPUTS_SHOWN]
-    figure, axes = new_figure(
-        len(rows), len(distortions), width=10, height=1.0 + 2.3 * len(rows), sharex=True, sharey="row", squeeze=False
-    )
+    shared = {"sharex": True, "sharey": "row", "squeeze": False}
+    figure, axes = new_figure(len(rows), len(distortions), width=10, height=1.0 + 2.3 * len(rows), **shared)
     for column, found in zip(axes.T, distortions, strict=True):
         shown = found.frequencies_hz < DISTORTION_LIMIT * found.frequencies_hz[found.excited].max()
         lines = {"excited": found.excited, "odd, not excited": found.odd, "even, not excited": found.even}
-        for j, ax in enumerate(column[: len(rows)]):
+        for j, ax in enumerate(column):
             for (label, kind), colour in zip(lines.items(), COLOURS, strict=False):
-                chosen = shown & kind
-                at, size = found.frequencies_hz[chosen], found.amplitudes[j, chosen]
+                at, size = found.frequencies_hz[shown & kind], found.amplitudes[j, shown & kind]
                 if at.size:
                     ax.semilogy(at, size, ".", color=colour, markersize=3, label=label)
             ax.semilogy(found.frequencies_hz[shown], found.noise[j, shown], color=GREY, linewidth=0.8, label="noise")

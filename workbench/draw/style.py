@@ -96,10 +96,8 @@ def plain_ticks(figure: Figure) -> Figure:
     """The figure with plain numbers, such as 0.1 and 20, on logarithmic axes of few decades."""
     for ax in figure.axes:
         for axis in (ax.xaxis, ax.yaxis):
-            if axis.get_scale() != "log":
-                continue
             low, high = sorted(axis.get_view_interval())
-            if not low > 0:
+            if axis.get_scale() != "log" or not low > 0:
                 continue
             if high / low < PLAIN_DECADES and low >= PLAIN_LEAST and high <= 1.0 / PLAIN_LEAST:
                 axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -109,9 +107,8 @@ def plain_ticks(figure: Figure) -> Figure:
 
 def _plain_minor(extent: float) -> FuncFormatter:
     """The formatter of ticks between decades: few, but with those of the decades at least two."""
-    if extent <= FEWER_NUMBERS:  # such as 0.14 and 0.16
-        return FuncFormatter(lambda value, _: f"{value:g}")
-    return FuncFormatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "2357" else "")
+    shown = "123456789" if extent <= FEWER_NUMBERS else "2357"  # first digits; all such as 0.14 and 0.16
+    return FuncFormatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in shown else "")
 
 
 def envelope(y: np.ndarray) -> np.ndarray:

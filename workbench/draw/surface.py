@@ -2,9 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
@@ -13,7 +14,7 @@ from matplotlib.patches import Patch as Swatch
 from matplotlib.ticker import MaxNLocator
 
 from workbench.design.loop.closed_loop import Response
-from workbench.draw.motion import SWAY, Net, frame_net, scattered_net
+from workbench.draw.motion import SWAY, Wireframe, frame_wireframe, sensor_wireframe
 from workbench.draw.style import COLOURS, GREY, new_figure, panels, prefixed
 from workbench.identification.shapes.bands import Bands
 from workbench.renamed import former_arguments
@@ -56,13 +57,10 @@ def plot_surface_modes(
         for along in _held_edges(x, y, fields):
             ax.plot(*along, color=COLOURS[6], linewidth=4, solid_capstyle="butt", clip_on=False)
         ax.set_title(f"mode {r + 1}: {modes.frequencies_hz[r]:.4g} Hz", fontsize=10)
-    a, b = x[-1], y[-1]
-    axes[columns * ((count - 1) // columns)].set(xticks=(0.0, a), yticks=(0.0, b), xlabel="x [m]", ylabel="y [m]")
-    handles = [
-        Swatch(facecolor=RED, label="up"),
-        Swatch(facecolor=BLUE, label="down"),
-        Line2D([], [], color="black", linewidth=1.2, label="nodal line: at rest"),
-    ]
+    ticks = {"xticks": (0.0, x[-1]), "yticks": (0.0, y[-1])}
+    axes[columns * ((count - 1) // columns)].set(**ticks, xlabel="x [m]", ylabel="y [m]")
+    handles: list[Artist] = [Swatch(facecolor=RED, label="up"), Swatch(facecolor=BLUE, label="down")]
+    handles.append(Line2D([], [], color="black", linewidth=1.2, label="nodal line: at rest"))
     if _held_edges(x, y, fields):
         handles.append(Line2D([], [], color=COLOURS[6], linewidth=4, label="supported edge"))
     if places is not None:
@@ -82,12 +80,9 @@ def plot_surface_bands(bands: Bands) -> Figure:
     if np.linalg.matrix_rank(np.column_stack([x - x.mean(), y - y.mean()])) < 2:
         raise ValueError("bands over a rectangle need places that are not all on one line: give a grid")
     n = bands.phi.shape[1]
-    wide, high = np.ptp(x), np.ptp(y)
-    figure, grid = new_figure(
-        2, n, width=max(4.0, 2.9 * n), height=2 * (2.5 * min(high / wide, 1.6) + 0.8), squeeze=False
-    )
-    for r in range(n):
-        top, bottom = grid[:, r]
+    height = 2 * (2.5 * min(np.ptp(y) / np.ptp(x), 1.6) + 0.8)
+    figure, grid = new_figure(2, n, width=max(4.0, 2.9 * n), height=height, squeeze=False)
+    for r, (top, bottom) in enumerate(grid.T):
         largest = np.abs(bands.phi[:, r]).max()
         top.tricontourf(x, y, bands.phi[:, r], levels=largest * np.linspace(-1.0, 1.0, 2 * LEVELS + 1), cmap="RdBu_r")
         top.set_title(f"mode {r + 1}", fontsize=10)
@@ -115,20 +110,18 @@ def plot_surface_motion(
         actuators: (n_actuators, 2) places, m, marked by crosses.
         impulse_at: place of the impulse, m, marked by a star.
     """
-    first = next(iter(responses.values()))
-    figure, grid = new_figure(
-        len(responses), len(times), width=2.6 * len(times), height=2.1 * len(responses) + 0.3, squeeze=False
-    )
-    drawn, instants = {}, {}
-    for name, response in responses.items():
+    first, (rows, columns) = next(iter(responses.values())), (len(responses), len(times))
+    figure, grid = new_figure(rows, columns, width=2.6 * columns, height=2.1 * rows + 0.3, squeeze=False)
+    drawn = []
+    for response in responses.values():
         nearest = [int(np.argmin(np.abs(response.time - t))) for t in times]
-        instants[name] = response.time[nearest]
-        drawn[name] = _over(response.modes, response.modal[: response.modes.n_modes, nearest])
-    limit = max(float(np.abs(fields).max()) for _, _, fields in drawn.values()) or 1.0  # 1 if all are at rest
+        modal = response.modal[: response.modes.n_modes, nearest]
+        drawn.append((response.time[nearest], *_over(response.modes, modal)))
+    limit = max(float(np.abs(fields).max()) for *_, fields in drawn) or 1.0  # 1 if all are at rest
     factor, unit = prefixed(limit, "m")
     limit *= factor
-    for row, (name, (x, y, fields)) in zip(grid, drawn.items()):
-        for ax, time, field in zip(row, instants[name], fields):
+    for row, name, (instants, x, y, fields) in zip(grid, responses, drawn):
+        for ax, time, field in zip(row, instants, fields):
             image = _coloured(ax, x, y, factor * field, limit)
             if actuators is not None:
                 ax.plot(*actuators.T, "x", color="black", markersize=6, label="actuator")
@@ -138,8 +131,7 @@ def plot_surface_motion(
         row[0].set_ylabel(name, fontsize=11)
     for ax in grid.flat:
         _bare(ax, first.modes)
-    a, b = cast(Rectangle, first.modes.domain).length
-    grid[-1, 0].set(xticks=[0.0, a], yticks=[0.0, b], xlabel="x [m]")
+    grid[-1, 0].set(xticks=[0.0, x[-1]], yticks=[0.0, y[-1]], xlabel="x [m]")
     # between the numbers of its axis, whose label is the name of the response
     look: Any = {"rotation": 90, "ha": "right", "va": "center", "transform": grid[-1, 0].transAxes}
     grid[-1, 0].text(-0.04, 0.5, "y [m]", **look)
@@ -154,37 +146,34 @@ def plot_surface_motion(
 def plot_point_modes(modes: Modes, *, count: int | None = None) -> Figure:
     """Shapes at named points, a panel per mode: the structure at rest grey, displaced blue, neighbouring nodes joined.
 
-    A plane structure is seen from the front, any other in an oblique view: x to the right, z up, y away.
-
-    Args:
-        count: number of modes, lowest first; all unless given.
+    A plane structure is seen from the front, any other in an oblique view: x to the right, z up, y away. Of `count`
+    modes, the lowest; all unless given.
 
     Raises:
         ValueError: modes of another domain, or points without positions.
     """
-    return _net_panels(frame_net(modes.domain), modes, min(count or modes.n_modes, modes.n_modes))
+    return _wireframe_panels(frame_wireframe(modes.domain), modes, min(count or modes.n_modes, modes.n_modes))
 
 
 def plot_scattered_modes(modes: SampledModes, *, count: int) -> Figure:
     """Shapes at sensors on a plate, a panel per mode, at the phase of largest motion."""
     phase = np.exp(-0.5j * np.angle(np.sum(modes.shapes**2, axis=0)))
-    turned = replace(modes, shapes=modes.shapes * phase)
-    return _net_panels(scattered_net(modes.positions), turned, min(count, modes.n_modes))
+    at_phase = replace(modes, shapes=modes.shapes * phase)
+    return _wireframe_panels(sensor_wireframe(modes.positions), at_phase, min(count, modes.n_modes))
 
 
-def _net_panels(net: Net, modes: Modes | SampledModes, count: int) -> Figure:
-    moves = net.moves(modes).real
-    width = 2.8 * min(COLUMNS, count)
-    figure, axes = panels(count, COLUMNS, width=width, row_height=2.8, margin=0.4)
+def _wireframe_panels(wireframe: Wireframe, modes: Modes | SampledModes, count: int) -> Figure:
+    moves = wireframe.moves(modes).real
+    figure, axes = panels(count, COLUMNS, width=2.8 * min(COLUMNS, count), row_height=2.8, margin=0.4)
     for r, ax in enumerate(axes):
-        draw_moved(ax, net, moves[:, :, r])
+        draw_moved(ax, wireframe, moves[:, :, r])
         ax.set_title(f"mode {r + 1}: {modes.frequencies_hz[r]:.4g} Hz", fontsize=10)
     figure.legend(handles=rest_and_moved(), loc="outside lower center", ncols=2, fontsize=9)
     return figure
 
 
 def rest_and_moved() -> list[Line2D]:
-    """Legend handles of a net at rest and displaced."""
+    """Legend handles of a wireframe at rest and displaced."""
     states = (GREY, "at rest"), (COLOURS[0], "moved")
     return [Line2D([], [], color=colour, marker="o", label=state) for colour, state in states]
 
@@ -197,11 +186,11 @@ def draw_nodal_lines(ax: Axes, modes: Modes, mode: int) -> None:
     _bare(ax, modes)
 
 
-def draw_moved(ax: Axes, net: Net, moves: np.ndarray) -> None:
-    """Draw a net at rest in grey, and displaced by `moves` (n_spots, 2), scaled to be visible, in blue."""
-    far = SWAY * np.ptp(net.rest, axis=0).max() / (np.abs(moves).max() or 1.0)
-    for at, colour in ((net.rest, GREY), (net.rest + far * moves, COLOURS[0])):
-        for ends in net.lines:
+def draw_moved(ax: Axes, wireframe: Wireframe, moves: np.ndarray) -> None:
+    """Draw a wireframe at rest in grey, and displaced by `moves` (n_nodes, 2), scaled to be visible, in blue."""
+    far = SWAY * np.ptp(wireframe.rest, axis=0).max() / (np.abs(moves).max() or 1.0)
+    for at, colour in ((wireframe.rest, GREY), (wireframe.rest + far * moves, COLOURS[0])):
+        for ends in wireframe.lines:
             ax.plot(*at[ends].T, color=colour, linewidth=1.6)
         ax.plot(*at.T, "o", color=colour, markersize=3)
     ax.set_aspect("equal")
@@ -221,13 +210,9 @@ def _nodal_lines(ax: Axes, x: np.ndarray, y: np.ndarray, field: np.ndarray, widt
 def _held_edges(x: np.ndarray, y: np.ndarray, fields: np.ndarray) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
     """The edges along which all fields are zero, each by its ends: (x, x), (y, y)."""
     nothing, (a, b) = HELD * np.abs(fields).max(), (x[-1], y[-1])
-    edges = (
-        (fields[:, 0], ((0.0, 0.0), (0.0, b))),
-        (fields[:, -1], ((a, a), (0.0, b))),
-        (fields[:, :, 0], ((0.0, a), (0.0, 0.0))),
-        (fields[:, :, -1], ((0.0, a), (b, b))),
-    )
-    return [ends for along, ends in edges if np.abs(along).max() < nothing]
+    along = fields[:, 0], fields[:, -1], fields[:, :, 0], fields[:, :, -1]
+    edges = ((0.0, 0.0), (0.0, b)), ((a, a), (0.0, b)), ((0.0, a), (0.0, 0.0)), ((0.0, a), (b, b))
+    return [ends for values, ends in zip(along, edges) if np.abs(values).max() < nothing]
 
 
 def _over(modes: Modes, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

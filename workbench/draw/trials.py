@@ -8,19 +8,19 @@ from matplotlib.figure import Figure
 
 from workbench.draw.style import COLOURS, new_figure
 from workbench.gap.effects.effect import label_in_words
-from workbench.trials.scoring import Tally
+from workbench.trials.scoring import Statistics
 
 FAMILY = {"single": "one effect", "pair": "two effects", "none": "nothing", "unknown": "outside the catalogue"}
 BOTH = FAMILY["pair"]  # the row of all pairs
 MOST_ROWS = 24  # of a column
 
 
-def plot_confusion(tally: Tally) -> Figure:
+def plot_confusion(statistics: Statistics) -> Figure:
     """A row per true effect: the share of its cases that are named correctly, their number, and what else is named.
 
     All pairs have one row.
     """
-    rows = _rows(tally)
+    rows = _rows(statistics)
     names = sorted(rows, key=_order)
     columns = 1 + (len(names) > MOST_ROWS)
     each = -(-len(names) // columns)
@@ -28,8 +28,8 @@ def plot_confusion(tally: Tally) -> Figure:
     figure, axes = new_figure(1, columns, **options)
     for ax, first in zip(axes[0], range(0, len(names), each)):
         _table(ax, names[first : first + each], rows, each)
-    total = sum(of for _, of in tally.shares.values())
-    shares = [f"{FAMILY[family]} {right} of {of}" for family, (right, of) in tally.shares.items()]
+    total = sum(of for _, of in statistics.shares.values())
+    shares = [f"{FAMILY[family]} {right} of {of}" for family, (right, of) in statistics.shares.items()]
     figure.suptitle(f"{total} blind cases, named correctly: {', '.join(shares)}", x=0.01, ha="left", fontsize=11)
     return figure
 
@@ -49,10 +49,10 @@ def _table(ax: Axes, names: list[str], rows: dict[str, Counter[str]], height: in
     ax.grid(False)
 
 
-def _rows(tally: Tally) -> dict[str, Counter[str]]:
+def _rows(statistics: Statistics) -> dict[str, Counter[str]]:
     """Numbers of cases by true effect and by what is named."""
     rows: dict[str, Counter[str]] = {}
-    for (hidden, named), count in tally.counts.items():
+    for (hidden, named), count in statistics.counts.items():
         pair = " + " in hidden
         rows.setdefault(BOTH if pair else hidden, Counter())[BOTH if pair and named == hidden else named] += count
     return rows

@@ -37,9 +37,7 @@ def bench_server(
     """The server of the bench on 127.0.0.1, not yet serving.
 
     Args:
-        rig: the rig on which designs are evaluated.
         structure: the TOML description of the rig, saved with a design.
-        units: of the rig.
         port: to listen on; 0 for any free one.
         folder: where designs are saved as studies.
 

@@ -22,8 +22,7 @@ class StudyFile:
     """A study's script.
 
     Attributes:
-        path: of the script.
-        name: the stem of the path.
+        path, name: of the script, and its stem.
         question: the first line of the docstring.
         needs_data: what --data must name; None if the study needs no data.
         fault: why the study cannot be run; None if it can.
@@ -41,20 +40,14 @@ class StudyFile:
 def study_scripts(*, here_first: bool = False) -> dict[str, Path]:
     """The scripts by name: those in `studies/` of the current folder, and those installed with the package.
 
-    Args:
-        here_first: only those of the current folder, if there are any.
+    With `here_first` only those of the current folder, if there are any.
     """
     root = Path(__file__).resolve().parents[2]
     # beside the package (a source tree, or an installer's --target), or in the data folder of the interpreter
     installed = [folder / "share" / "workbench" / "studies" for folder in (root, Path(sysconfig.get_path("data")))]
     came = next((folder for folder in (root / "studies", *installed) if folder.is_dir()), installed[-1])
-    folders = [Path.cwd() / "studies", came]
-    scripts: dict[str, Path] = {}
-    for folder in folders:
-        if here_first and scripts:
-            break
-        for path in sorted(folder.glob("*.py")):
-            scripts.setdefault(path.stem, path)
+    here, others = ({path.stem: path for path in folder.glob("*.py")} for folder in (Path.cwd() / "studies", came))
+    scripts = here if here_first and here else others | here
     if not scripts:
         raise StudyError("there are no studies: none are installed, and the current folder has no folder studies/")
     return dict(sorted(scripts.items()))
@@ -91,14 +84,14 @@ def describe(path: Path) -> StudyFile:
 
 def list_studies(*, here_first: bool = False) -> list[StudyFile]:
     """All studies, by name; an invalid script is listed with its fault, so that the others still run."""
-    return [_described(path) for path in study_scripts(here_first=here_first).values()]
-
-
-def _described(path: Path) -> StudyFile:
-    try:
-        return describe(path)
-    except StudyError as error:
-        return StudyFile(path, path.stem, "", None, str(error), defined=not isinstance(error, NoStudyError))
+    studies = []
+    for path in study_scripts(here_first=here_first).values():
+        try:
+            studies.append(describe(path))
+        except StudyError as error:
+            defined = not isinstance(error, NoStudyError)
+            studies.append(StudyFile(path, path.stem, "", None, str(error), defined))
+    return studies
 
 
 def find_study(name: str) -> StudyFile:
@@ -121,10 +114,7 @@ def find_study(name: str) -> StudyFile:
 def run_study(study: StudyFile, data: Path | None, outcome: Outcome, root: Path) -> tuple[Path, Path]:
     """Run a study; write its JSON (studies/results of its project, else out/results), its page and its tables (out).
 
-    The study can import modules from its own folder.
-
-    Returns:
-        The paths of the JSON and of the page.
+    The study can import modules from its own folder. Returned are the paths of the JSON and of the page.
 
     Raises:
         StudyError: needed data are not given, or do not exist.
@@ -143,7 +133,10 @@ def run_study(study: StudyFile, data: Path | None, outcome: Outcome, root: Path)
         module.study(outcome, data)
     outcome.write_runs(root / "out")
     made_by = f"workbench study {study.name}" + (f" --data {data}" if data else "")
-    page = study_page(outcome, root / "out", inputs=_inputs(study, data), made_by=made_by)
+    inputs = {f"studies/{study.path.name}": study.path.read_text(encoding="utf-8")}
+    if data is not None and data.is_file():
+        inputs["data (SHA-256)"] = f"{hashlib.sha256(data.read_bytes()).hexdigest()}  {data.name}"
+    page = study_page(outcome, root / "out", inputs=inputs, made_by=made_by)
     owned = study.path.resolve().parent == root / "studies"
     return outcome.write(study.path.parent / "results" if owned else root / "out" / "results"), page
 
@@ -163,11 +156,3 @@ def _own_folder(script: Path) -> Iterator[None]:
         raise
     finally:
         sys.path.remove(folder)
-
-
-def _inputs(study: StudyFile, data: Path | None) -> dict[str, str]:
-    """The source of the script, and a checksum of the data, by title."""
-    found = {f"studies/{study.path.name}": study.path.read_text(encoding="utf-8")}
-    if data is not None and data.is_file():
-        found["data (SHA-256)"] = f"{hashlib.sha256(data.read_bytes()).hexdigest()}  {data.name}"
-    return found

@@ -19,7 +19,7 @@ from workbench.design.loop.closed_loop import ClosedLoop, Response, close_loop, 
 from workbench.design.placement.task import patch_of
 from workbench.design.spillover.explain import explain_spillover
 from workbench.design.spillover.spillover import Spillover, finite_spillover
-from workbench.draw.motion import frame_net
+from workbench.draw.motion import frame_wireframe
 from workbench.records.units import SI, Units
 from workbench.rig.actuators import Actuator, command_unit
 from workbench.rig.rig import Rig
@@ -68,8 +68,6 @@ class DesignResult:
     """The results of a design.
 
     Attributes:
-        law: the control law.
-        loop: the closed loop.
         response: to the impulse, at N_TIMES instants.
         work: spillover work in every mode, with residual modes initially at rest.
         effort: ∫ FᵀF dt up to the final time.
@@ -95,8 +93,7 @@ def design_from(content: Mapping[str, Any]) -> Design:
         if not isinstance(content[name], list) or len(content[name]) > MOST_TRANSDUCERS:
             raise StudyError(f"{name} is a list of at most {MOST_TRANSDUCERS} entries")
     places = {name: tuple(_place(v, name) for v in content[name]) for name in ("actuators", "sensors")}
-    weight = tuple(_number(v, "weight") for v in content["weight"])
-    count = content["controlled"]
+    weight, count = tuple(_number(v, "weight") for v in content["weight"]), content["controlled"]
     if not isinstance(count, int) or isinstance(count, bool) or count < 1:
         raise StudyError(f"controlled is the number of controlled modes, at least 1; got {count!r:.40}")
     if content["law"] not in LAWS:
@@ -106,10 +103,8 @@ def design_from(content: Mapping[str, Any]) -> Design:
     final_time = _number(content["final_time"], "final_time")
     if final_time <= 0:
         raise StudyError(f"final_time must be positive; got {final_time:g}")
-    return Design(
-        **places, controlled=count, weight=weight, law=content["law"],
-        impulse_at=_place(content["impulse_at"], "impulse_at"), final_time=final_time,
-    )  # fmt: skip
+    impulse_at = _place(content["impulse_at"], "impulse_at")
+    return Design(**{**content, **places, "weight": weight, "impulse_at": impulse_at, "final_time": final_time})
 
 
 def _place(value: object, name: str) -> Place:
@@ -148,20 +143,13 @@ def start(rig: Rig) -> Design:
 
 
 def _domain(rig: Rig) -> Domain:
-    """The domain in which actuators can be moved.
-
-    Raises:
-        StudyError: points without positions, or modes of an unknown structure.
-    """
-    domain = rig.modes.domain
-    if isinstance(domain, NamedPoints):
-        if domain.positions is None:
-            raise StudyError(
-                "points without positions cannot be drawn; give them in a table of points, or describe the structure as"
-                " a beam, a rod or a plate"
-            )
-    elif rig.structure is None:
-        raise StudyError("the rig has no structure; describe it as a beam, a rod or a plate")
+    """The domain in which actuators can be moved."""
+    domain, kinds = rig.modes.domain, "a beam, a rod or a plate"
+    if isinstance(domain, NamedPoints) and domain.positions is None:
+        wanted = f"give them in a table of points, or describe the structure as {kinds}"
+        raise StudyError(f"points without positions cannot be drawn; {wanted}")
+    if not isinstance(domain, NamedPoints) and rig.structure is None:
+        raise StudyError(f"the rig has no structure; describe it as {kinds}")
     return domain
 
 
@@ -185,13 +173,13 @@ def try_out(rig: Rig, design: Design) -> DesignResult:
     Raises:
         ValueError: places, weights or numbers that admit no design; the message states a remedy.
     """
-    modes, domain = rig.modes, _domain(rig)
+    modes, domain, places = rig.modes, _domain(rig), [*design.actuators, *design.sensors, design.impulse_at]
+    on_plate = isinstance(domain, Rectangle)
     if isinstance(domain, NamedPoints):
-        domain.locate([*design.actuators, *design.sensors, design.impulse_at])
-    for at in () if isinstance(domain, NamedPoints) else (*design.actuators, *design.sensors, design.impulse_at):
-        if isinstance(at, tuple) != isinstance(domain, Rectangle):
-            wanted = "a pair (x, y) on the plate" if isinstance(domain, Rectangle) else "a position along the structure"
-            raise StudyError(f"a place is {wanted}, m; got {at}")
+        domain.locate(places)
+    elif wrong := [at for at in places if isinstance(at, tuple) != on_plate]:
+        wanted = "a pair (x, y) on the plate" if on_plate else "a position along the structure"
+        raise StudyError(f"a place is {wanted}, m; got {wrong[0]}")
     if design.controlled > modes.n_modes:
         raise DesignError(f"{design.controlled} controlled modes, but the rig has {modes.n_modes}; control fewer")
     kind = _kind(rig, design.impulse_at)
@@ -200,9 +188,8 @@ def try_out(rig: Rig, design: Design) -> DesignResult:
         law = imsc(modes, design.controlled, actuators, weight=design.weight)
     else:
         law = coupled_lqr(modes, design.controlled, actuators, weight=design.weight[0])
-    through = None
-    if design.sensors:
-        through = filter_on(rig.structure, modes, range(design.controlled), design.sensors)
+    sensed = design.sensors
+    through = filter_on(rig.structure, modes, range(design.controlled), sensed) if sensed else None
     loop = close_loop(modes, law, through)
     fastest = float(loop.poles.real.max())
     if fastest * design.final_time > MOST_GROWTH:
@@ -220,11 +207,11 @@ def _instability(modes: Modes, law: Law, through: ModalFilter | None, fastest: f
     found = f"the loop is unstable, with a pole of real part {fastest:+.3g} 1/s"
     if through is None:
         return f"{found}; raise R, or move actuators"
-    told = explain_spillover(modes, filtered(law, through))
-    growing = [str(1 + one.mode) for one in told.shifts if one.closed_pole.real > 0.0]
+    explained = explain_spillover(modes, filtered(law, through))
+    growing = [str(1 + one.mode) for one in explained.shifts if one.closed_pole.real > 0.0]
     if growing:
         found += f": residual mode{'s' * (len(growing) > 1)} {joined_in_words(growing)} grow{'s' * (len(growing) == 1)}"
-    rate = told.reduced_decay_rate
+    rate = explained.reduced_decay_rate
     alone = "stable" if rate > 0.0 else f"not stable either, of decay rate {rate:.3g} 1/s"
     return f"{found}; without residual modes it is {alone}; move or add sensors, or raise R"
 
@@ -298,20 +285,20 @@ def _field(rig: Rig, domain: Interval | Rectangle) -> dict[str, Any]:
 
 def _frame(rig: Rig, domain: NamedPoints) -> dict[str, Any]:
     """Drawing data of a frame: nodes, lines between them, mode shapes, and the drawn position of each point."""
-    net = frame_net(domain)
-    corner, size = net.rest.min(axis=0), float(np.ptp(net.rest, axis=0).max())
+    wireframe = frame_wireframe(domain)
+    corner, size = wireframe.rest.min(axis=0), float(np.ptp(wireframe.rest, axis=0).max())
     names = domain.grid()
     # points of one node are drawn beside the node, each in its own direction
     ways = {"": (0.0, 0.0), "x": (1.0, 0.0), "y": (0.0, 1.0), "z": (0.6, 0.6)}
-    moves = np.asarray(net.moves(rig.modes))
+    moves = np.asarray(wireframe.moves(rig.modes))
     return {
-        "length": all_rounded(np.maximum(np.ptp(net.rest, axis=0), SLENDER * size)),
+        "length": all_rounded(np.maximum(np.ptp(wireframe.rest, axis=0), SLENDER * size)),
         "points": {
             "names": names,
-            "spots": all_rounded(np.array([net.at(name) for name in names]) - corner),
+            "spots": all_rounded(np.array([wireframe.at(name) for name in names]) - corner),
             "ways": [ways[domain.directions[domain.locate(name)[0]]] for name in names],
-            "rest": all_rounded(net.rest - corner),
-            "lines": net.lines,
+            "rest": all_rounded(wireframe.rest - corner),
+            "lines": wireframe.lines,
         },
         "shapes": all_rounded(moves.reshape(-1, rig.modes.n_modes)),
         "patch": [],
@@ -319,11 +306,7 @@ def _frame(rig: Rig, domain: NamedPoints) -> dict[str, Any]:
 
 
 def read_structure(path: Path | None) -> tuple[Rig, str, Units]:
-    """The rig of a TOML file or case folder, with the TOML text and its units; unless given, the dissertation's beam.
-
-    Raises:
-        CaseError: naming the file, the key, the value, and what would be right.
-    """
+    """The rig of a TOML file or case folder, with the TOML text and its units; the beam of the dissertation if None."""
     path = Path(__file__).with_name("assets") / "bench.toml" if path is None else path
     path = path / "case.toml" if path.is_dir() else path
     return read_rig(path), path.read_text(encoding="utf-8"), read_units(path)

@@ -6,14 +6,17 @@ from dataclasses import replace
 from pathlib import Path
 
 from workbench.cases.case import Case
-from workbench.identification.driven import DrivenModes, identify_driven
+from workbench.identification.driven import identify_driven
 from workbench.identification.rig_from import rig_from
 from workbench.records.files import read_record
 from workbench.records.record import Record
-from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED
 
 UNSCALED = "no output is at the place of an input"  # how the warning of `rig_from` begins that has another remedy here
+NO_SCALE = (
+    "so the shapes have no scale: responses to these inputs are right, those to masses, springs or forces elsewhere are"
+    " not; give --driving-point INPUT,OUTPUT, an input and the output at its place"
+)
 
 
 def measured_case(
@@ -49,7 +52,8 @@ def measured_case(
         channels = [replace(c, quantity=c.quantity or quantity, unit=c.unit) for c in record.output_channels]
         return replace(record, output_channels=tuple(channels), name=name)
 
-    names = _names((*records, *validation))
+    every = (*records, *validation)
+    names = _names(every)
     low = read(nominal, nominal.stem)
     if not low.n_inputs:
         forces = ",".join(channel.name for channel in low.output_channels if channel.quantity == "force") or "NAME"
@@ -60,32 +64,20 @@ def measured_case(
     if len(driving_point) not in (0, 2):
         raise ValueError(f"--driving-point is INPUT,OUTPUT; got {','.join(driving_point)}")
     pair = (driving_point[0], driving_point[1]) if driving_point else None
-    read_all = tuple(map(read, (*records, *validation), names))
-    for path, record in zip((*records, *validation), read_all, strict=True):
+    read_all = tuple(map(read, every, names))
+    for path, record in zip(every, read_all, strict=True):
         if record.repeats(low):
             raise ValueError(
                 f"{path} holds the same measurement as --nominal {nominal}: the model is identified from it, so it"
                 " shows no gap; give --nominal a record at low level, and --records and --validation others"
             )
-    rig = _rig_of(identify_driven([low]), pair)
-    return Case(nominal.stem, rig, read_all[: len(records)], read_all[len(records) :])
-
-
-def _rig_of(identified: DrivenModes, driving_point: tuple[str, str] | None) -> Rig:
-    """The rig of identified modes; a warning that they have no scale names the option that gives one."""
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        rig = rig_from(identified, driving_point=driving_point)
-    for each in told:
-        message = str(each.message)
-        if message.startswith(UNSCALED):
-            message = (
-                f"{UNSCALED}, so the shapes have no scale: responses to these inputs are right, those to masses,"
-                " springs or forces elsewhere are not; give --driving-point INPUT,OUTPUT, an input and the output at"
-                " its place"
-            )
-        warnings.warn(message, each.category, stacklevel=3)
-    return rig
+        rig = rig_from(identify_driven([low]), driving_point=pair)
+    for each in caught:
+        unscaled = str(each.message).startswith(UNSCALED)
+        warnings.warn(f"{UNSCALED}, {NO_SCALE}" if unscaled else str(each.message), each.category, stacklevel=2)
+    return Case(nominal.stem, rig, read_all[: len(records)], read_all[len(records) :])
 
 
 def _names(paths: Sequence[Path]) -> list[str]:

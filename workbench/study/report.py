@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
@@ -76,7 +76,6 @@ def case_page_content(folder: Path) -> PageContent:
     """The page of a case before any diagnosis: the nominal modes, and the records beside the nominal responses."""
     case = read_case(folder)
     rig, records = case.rig, (*case.fit, *case.validation)
-    beside = plot_responses({"nominal": rig}, records)
     caption = "Measured beside the nominal model, at the sensor and in the segment where they differ most."
     rows = [
         (r.name, "fit" if r in case.fit else "validate", r.n_samples, r.sample_rate_hz, float(r.inputs.std()))
@@ -87,7 +86,7 @@ def case_page_content(folder: Path) -> PageContent:
     return PageContent(
         title=f"Case {case.name}, before any diagnosis",
         lines=(f"{len(rig.actuators)} inputs, {len(rig.sensors)} sensors, {len(records)} records.",),
-        blocks=[*moving_modes(rig, {"nominal": rig.modes}), block(beside, caption)],
+        blocks=[*moving_modes(rig, {"nominal": rig.modes}), block(plot_responses({"nominal": rig}, records), caption)],
         tables=[
             ("Records", ("record", "use", "samples", "sample rate [Hz]", level), rows),
             ("Nominal modes", ("mode", "frequency [Hz]", "damping ratio"), modes),
@@ -108,7 +107,7 @@ def page_content_in(path: Path) -> PageContent:
     if path.stat().st_size > MOST_BYTES:
         raise StudyError(f"{path} has {path.stat().st_size} bytes; a report reads at most {MOST_BYTES}")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse, parse_float=_finite)
+        content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_finite, parse_float=_finite)
     except (ValueError, RecursionError) as error:
         raise StudyError(f"{path} cannot be read as JSON: {error}") from error
     if isinstance(content, list):
@@ -129,19 +128,16 @@ def page_content_in(path: Path) -> PageContent:
     return PageContent(made_by=f"workbench report {path.name}", **page_content)
 
 
-def _refuse(word: str) -> NoReturn:
-    raise ValueError(f"{word} is not a JSON number")
-
-
 def _finite(digits: str) -> float:
     value = float(digits)
-    return value if np.isfinite(value) else _refuse(digits)
+    if not np.isfinite(value):
+        raise ValueError(f"{digits} is not a JSON number")
+    return value
 
 
 def _tables(content: Mapping[str, Any]) -> list[Table]:
-    single = {name: value for name, value in content.items() if isinstance(value, str | int | float | bool)}
-    alone = [("Figures", ("name", "value"), [[name, value] for name, value in single.items()])] if single else []
-    return [*alone, *tables_of(content)]
+    single = [[name, value] for name, value in content.items() if isinstance(value, str | int | float | bool)]
+    return [*([("Figures", ("name", "value"), single)] if single else []), *tables_of(content)]
 
 
 def _words(lines: list[str]) -> list[str]:
@@ -182,9 +178,8 @@ def identified(content: dict[str, Any]) -> dict[str, Any]:
         numbered = "" if modes.on_interval or modes.on_plate else ", numbered as in the record"
         blocks.insert(0, block(moving, f"The identified shapes at the sensors{numbered}, with phase."))
     if len(shapes) > 1 and hertz.size > 1:
-        blocks.append(
-            block(plot_mac(mac(modes.shapes, modes.shapes)), "Modal assurance criterion of each pair of modes.")
-        )
+        criterion = plot_mac(mac(modes.shapes, modes.shapes))
+        blocks.append(block(criterion, "Modal assurance criterion of each pair of modes."))
     rows = [
         [r + 1, *to_its_error(float(f), float(f_std)), *to_its_error(float(100.0 * zeta), float(100.0 * error))]
         for r, (f, f_std, zeta, error) in enumerate(zip(hertz, hertz_std, modes.zeta, zeta_std, strict=True))
@@ -217,20 +212,13 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
     laws, units = content["laws"], _units_of(content)
     controlled = content.get("controlled", ())
     first = 0 if 0 in controlled else 1  # files of earlier versions count modes from zero
-    works = {
-        law["law"]: np.array([w for r, w in enumerate(law["work"], first) if r not in controlled], float)
-        for law in laws
-    }
-    poles = {law["law"]: _poles_of(law) for law in laws}
-    rows = [
-        [
-            law["law"],
-            *(short(law[key]) for key in ("cost", "effort", "peak_force")),
-            short(works[law["law"]].sum()),
-            law.get("stability", stability(poles[law["law"]])),
-        ]
-        for law in laws
-    ]
+    works, poles, rows = {}, {}, []
+    for law in laws:
+        name = law["law"]
+        works[name] = np.array([w for r, w in enumerate(law["work"], first) if r not in controlled], float)
+        poles[name] = _poles_of(law)
+        figures = [*(law[key] for key in ("cost", "effort", "peak_force")), works[name].sum()]
+        rows.append([name, *map(short, figures), law.get("stability", stability(poles[name]))])
     through = [one for one in content.get("through_sensors", ()) if "stable" in one]
     sensed = [
         [
@@ -254,8 +242,7 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
         block(plot_poles(poles), "Closed-loop poles, every modal coordinate known."),
     ]
     if seen:
-        caption = "Closed-loop poles with sensors, including those of the estimators."
-        blocks.append(block(plot_poles(seen), caption))
+        blocks.append(block(plot_poles(seen), "Closed-loop poles with sensors, including those of the estimators."))
     headings = map(units.named, (*command_headings(str(content.get("command_unit", "N"))), "W_R [J]"))
     tables: list[Table] = [("Laws", ("law", "cost", *headings, "loop"), rows)]
     if sensed:
@@ -300,11 +287,11 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
     names = ["best found", *(str(one["status"]) for one in placements[1:])]
     places = {name: np.array(one["positions"]) for name, one in zip(names, placements, strict=True)}
     are_points = next(iter(places.values())).dtype.kind == "U"
-    texts = [places_text(at) for at in places.values()]
     works = {n: np.array(one["by_mode"], float) for n, one in zip(names, placements, strict=True)}
+    figures = ("residual_work", "effort", "peak_force", "condition")
     rows = [
-        [name, *(short(one[key]) for key in ("residual_work", "effort", "peak_force", "condition")), text]
-        for name, one, text in zip(names, placements, texts, strict=True)
+        [name, *(short(one[key]) for key in figures), places_text(places[name])]
+        for name, one in zip(names, placements, strict=True)
     ]
     first, bound = placements[0]["residual_work"], content.get("lower_bound")
     energy, found = units.named("J"), joined_in_words([_place_words(at, units) for at in placements[0]["positions"]])
@@ -321,10 +308,9 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
     blocks = [block(work, "Spillover work of each placement in each residual mode.")]
     if not are_points:
         where = plot_places(places, content.get("length"), forbidden=zones, impulse_at=impulse_at, units=units)
-        also = ["positions of the actuators", *["the place of the impulse"] * (impulse_at is not None)]
-        also += ["the forbidden zones, grey"] * bool(zones)
-        words = joined_in_words(also)
-        blocks.insert(0, block(where, f"{words[:1].upper()}{words[1:]}."))
+        drawn = ["Positions of the actuators", *["the place of the impulse"] * (impulse_at is not None)]
+        drawn += ["the forbidden zones, grey"] * bool(zones)
+        blocks.insert(0, block(where, f"{joined_in_words(drawn)}."))
     numbers = ("W_R [J]", *command_headings(str(content.get("command_unit", "N"))), "condition number of B")
     headings = ("placement", *map(units.named, (*numbers, "points" if are_points else "positions [m]")))
     return {
@@ -372,10 +358,7 @@ KINDS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
 
 
 def identification_page(
-    report: IdentificationReport,
-    measured: Sequence[Record | FrequencyResponses],
-    *,
-    made_by: str,
+    report: IdentificationReport, measured: Sequence[Record | FrequencyResponses], *, made_by: str
 ) -> PageContent:
     """The page of an identification report and its data; FRFs are shown over the fitted band."""
     content = identified({**report.content, "heading": report.heading, "lines": list(report.lines)})
@@ -385,15 +368,12 @@ def identification_page(
 
 def _stabilisation(report: IdentificationReport) -> list[dict[str, Any]]:
     decays = [replace(decay, outputs=decay.outputs[:, :MOST_SAMPLES]) for decay in report.decays]
-    if not decays:
-        return []
-    shortest = min(decay.n_samples for decay in decays)
+    shortest = min((decay.n_samples for decay in decays), default=0)
     highest = min(len(report.rows) + EXTRA_ORDERS, shortest // SAMPLES_PER_ORDER)
     if highest < 2:
         return []
     diagram = stabilise(decays, orders=range(1, highest + 1))
-    nyquist = 0.5 * decays[0].sample_rate_hz
-    figure = stabilisation_diagram(diagram, stable_modes(diagram).modes, nyquist)
+    figure = stabilisation_diagram(diagram, stable_modes(diagram).modes, 0.5 * decays[0].sample_rate_hz)
     return [block(figure, STABLE)]
 
 
@@ -405,9 +385,8 @@ def _response(every: Sequence[Record | FrequencyResponses], fitted: FrequencyRes
             measured = replace(measured, values=measured.values[..., kept], frequencies_hz=fitted.frequencies_hz)
         return [block(plot_frf_matrix(measured, fitted), "FRFs, measured and fitted (dashed).")]
     if measured.n_inputs == 1 and np.ptp(measured.inputs) and fitted is not None:
-        names = measured.output_names[:MOST_SENSORS]
+        names, left_out = measured.output_names[:MOST_SENSORS], measured.output_names[MOST_SENSORS:]
         beside = plot_frf_matrix(frequency_response(measured).select_outputs(names), fitted.select_outputs(names))
-        left_out = measured.output_names[MOST_SENSORS:]
         rest = f" Not drawn: {', '.join(left_out)}." if left_out else ""
         measured_by = "Frequency response, measured by Welch's method, whose windows blunt sharp peaks"
         return [

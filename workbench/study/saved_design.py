@@ -70,30 +70,21 @@ from workbench.draw.motion import mode_motion""",
 
 
 def save(rig: Rig, structure: str, design: Design, name: str, folder: Path) -> Path:
-    """Write a design as a study: folder/name.py, and the structure (TOML, and a table of named points) beside it.
-
-    Raises:
-        StudyError: an invalid name, or one that is taken.
-    """
-    path = free_path(name, folder)
+    """Write a design as a study: folder/name.py, and the structure (TOML, and a table of named points) beside it."""
+    path, domain = free_path(name, folder), rig.modes.domain
     tried = try_out(rig, design)
-    found = {"W_R": tried.work.residual_work, "effort": tried.effort}
-    domain = rig.modes.domain
-    imports, motion = MEMBER
-    if isinstance(domain, Rectangle):
-        imports, motion = PLATE
-    if isinstance(domain, NamedPoints):
-        imports, motion = FRAME
-        structure = TABLE.sub(rf'\1points = "{path.with_suffix(".csv").name}"', structure)
+    imports, motion = PLATE if isinstance(domain, Rectangle) else FRAME if isinstance(domain, NamedPoints) else MEMBER
+    arguments = "".join(f"    {field.name}={getattr(design, field.name)!r},\n" for field in fields(design))
     script = SCRIPT.format(
-        design=_written(design), shown=found, stable=not tried.loop.unstable_poles.size, imports=imports, motion=motion
+        design=f"Design(\n{arguments})",
+        shown={"W_R": tried.work.residual_work, "effort": tried.effort},
+        stable=not tried.loop.unstable_poles.size,
+        imports=imports,
+        motion=motion,
     )
+    if isinstance(domain, NamedPoints):
+        structure = TABLE.sub(rf'\1points = "{path.with_suffix(".csv").name}"', structure)
     write_whole(path.with_suffix(".toml"), structure)
     if isinstance(domain, NamedPoints):
         write_points(path.with_suffix(".csv"), domain, rig.modes.phi(domain.names))
     return write_whole(path, script)
-
-
-def _written(design: Design) -> str:
-    parts = (f"    {field.name}={getattr(design, field.name)!r},\n" for field in fields(design))
-    return f"Design(\n{''.join(parts)})"

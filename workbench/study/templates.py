@@ -24,11 +24,7 @@ def new_case(folder: Path) -> Path:
 
 
 def new_study(name: str, folder: Path) -> Path:
-    """Write a commented study, folder/name.py.
-
-    Raises:
-        StudyError: an invalid name, or one that is taken.
-    """
+    """Write a commented study, folder/name.py."""
     return write_whole(free_path(name, folder), (ASSETS / "study.py.txt").read_text(encoding="utf-8"))
 
 

@@ -2,14 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from workbench.arrays import Floats
 from workbench.cases.case import Case
 from workbench.rig.rig import Rig
-from workbench.structure.domain import Location, NamedPoints, Rectangle
 from workbench.structure.member import Structure
 from workbench.trials.finite_elements import Frame
 from workbench.trials.plant import ModalMotion, Plant, SolvedPlant, coloured_noise
@@ -52,9 +50,6 @@ def draw_bench(rng: np.random.Generator, structure: str = MEMBERS) -> Bench:
 
     Args:
         structure: "members" for a beam or a rod, "plates", or "frames", whose rig has only modes at named points.
-
-    Raises:
-        ValueError: an unknown structure.
     """
     rig, frame = draw_rig(rng, structure)
     top = min(int(rng.integers(3, 6)), rig.modes.n_modes) - 1
@@ -64,9 +59,8 @@ def draw_bench(rng: np.random.Generator, structure: str = MEMBERS) -> Bench:
     plant = bench.plant().solved()
     commands = multisine(bench, rng)
     moved, _ = plant.move(commands, bench.sample_time)
-    widest = np.sqrt(np.mean((plant.at_actuators @ moved[0].T) ** 2, axis=1)).max()
+    widest, fastest = (np.sqrt(np.mean((plant.at_actuators @ m.T) ** 2, axis=1)).max() for m in moved[:2])
     level = float(f"{rig.modes.domain.size * np.exp(rng.uniform(np.log(0.001), np.log(0.02))) / widest:.2g}")
-    fastest = np.sqrt(np.mean((plant.at_actuators @ moved[1].T) ** 2, axis=1)).max()
     low = plant.readings(moved, bench.sample_time).std(axis=1) * level * LEVELS["low"]
     noise = [float(f"{10 ** (-snr_db / 20) * value:.6g}") for value in low]
     sensors = tuple(replace(s, noise_std=n) for s, n in zip(rig.sensors, noise, strict=True))
@@ -86,15 +80,15 @@ def bench_of(case: Case) -> Bench:
     rows = [j for j, a in enumerate(case.rig.actuators) if not a.direct]
     if not rows:
         raise ValueError("every input of the case is a hammer; a trial needs an actuator to command")
-    level = {record: np.sqrt(np.mean(record.inputs[rows] ** 2, axis=1)).max() for record in case.fit}
-    loudest = max(level, key=lambda record: level[record])
-    if not level[loudest] > 0:
+    strongest = max(case.fit, key=lambda record: np.mean(record.inputs[rows] ** 2, axis=1).max())
+    squares = np.mean(strongest.inputs[rows] ** 2, axis=1)
+    if not squares.max() > 0:
         raise ValueError("no actuator acts in any record to fit; a trial takes its level and band from there")
-    row = rows[int(np.argmax(np.mean(loudest.inputs[rows] ** 2, axis=1)))]
-    power = np.cumsum(np.abs(np.fft.rfft(loudest.inputs[row] - loudest.inputs[row].mean())) ** 2)
-    frequency = np.fft.rfftfreq(loudest.n_samples, loudest.sample_time)
+    signal = strongest.inputs[rows[int(np.argmax(squares))]]
+    power = np.cumsum(np.abs(np.fft.rfft(signal - signal.mean())) ** 2)
+    frequency = np.fft.rfftfreq(strongest.n_samples, strongest.sample_time)
     band = float(frequency[np.searchsorted(power, 0.95 * power[-1])])
-    return Bench(case.rig, loudest.sample_time, band, float(level[loudest]), None, None)
+    return Bench(case.rig, strongest.sample_time, band, float(np.sqrt(squares.max())), None, None)
 
 
 def multisine(bench: Bench, rng: np.random.Generator) -> np.ndarray:
@@ -105,9 +99,8 @@ def multisine(bench: Bench, rng: np.random.Generator) -> np.ndarray:
 
     def wave() -> Floats:
         phases = rng.uniform(0.0, 2.0 * np.pi, lines.size)
-        values: Floats = np.sin(2.0 * np.pi * np.outer(lines, np.arange(SAMPLES)) / SAMPLES + phases[:, None]).sum(
-            axis=0
-        )
+        angles = 2.0 * np.pi * np.outer(lines, np.arange(SAMPLES)) / SAMPLES + phases[:, None]
+        values: Floats = np.sin(angles).sum(axis=0)
         return values / float(np.sqrt(np.mean(values**2)))
 
     return _commands(bench, wave)
@@ -148,12 +141,6 @@ def tested(
     return plant.move(commands, bench.sample_time, feedback=feedback, rng=rng)
 
 
-# --- the nominal motion on a bench
-
-DISTINCT = 0.1  # least sine of the angle between the modal force vectors at two named points
-COARSE = 0.2  # radians of the highest mode in one step: accurate enough to draw a strength
-
-
 class Unsuitable(ValueError):
     """A kind that is impossible on a bench, or a draw without a detectable gap."""
 
@@ -162,107 +149,3 @@ def relative_gap(difference: np.ndarray, measured: np.ndarray) -> float:
     """The rms of a difference (n_outputs, n_samples or 1) over the standard deviation of each measured output."""
     scale = measured.std(axis=1, keepdims=True)
     return float(np.sqrt(np.mean((difference / np.where(scale > 0, scale, 1.0)) ** 2)))
-
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """A bench with the nominal motion at its middle level, from which strengths are drawn.
-
-    Attributes:
-        commands: (n_inputs, n_samples) of the middle level.
-        moved: nominal modal motion.
-        outputs: (n_outputs, n_samples) nominal readings.
-    """
-
-    bench: Bench
-    commands: np.ndarray
-    moved: ModalMotion
-    outputs: np.ndarray
-
-    @classmethod
-    def of(cls, bench: Bench, commands: np.ndarray) -> "Scene":
-        nominal = bench.plant().solved()
-        moved, _ = nominal.move(commands, bench.sample_time, finest=COARSE)
-        return cls(bench, commands, moved, nominal.readings(moved, bench.sample_time))
-
-    @property
-    def rig(self) -> Rig:
-        """The nominal rig."""
-        return self.bench.rig
-
-    @property
-    def acting(self) -> list[str]:
-        """Names of the actuators that follow commands."""
-        return [a.name for a in self.rig.actuators if not a.direct]
-
-    def motion_at(self, where: Location) -> tuple[np.ndarray, np.ndarray]:
-        """Nominal displacement and velocity at a place, or between two, (n_samples,) each."""
-        shape = self.rig.modes.phi_at(where)
-        return self.moved[0] @ shape, self.moved[1] @ shape
-
-    def place(self, rng: np.random.Generator, *, between: bool = False) -> Location:
-        """A random place whose rms motion is at least a third of the largest.
-
-        Args:
-            between: whether half of the draws at named points are a pair `Between` two points.
-        """
-        domain = self.rig.modes.domain
-        if isinstance(domain, NamedPoints):
-            if domain.positions is not None:
-                return self._distinct(rng, between and rng.random() < 0.5)
-            grid: Any = np.array(domain.names)
-        else:
-            grid = domain.grid(24) if isinstance(domain, Rectangle) else np.linspace(0.05, 1.0, 96) * domain.size
-        rms = np.sqrt(np.mean((self.rig.modes.phi(grid) @ self.moved[0].T) ** 2, axis=1))
-        at = rng.choice(np.asarray(grid)[rms > rms.max() / 3])
-        if isinstance(domain, NamedPoints):
-            return str(at)
-        if isinstance(domain, Rectangle):
-            moved = at + rng.uniform(-0.02, 0.02, 2) * domain.length
-            x, y = np.clip(moved, 0.0, domain.length)
-            return round(float(x), 4), round(float(y), 4)
-        return round(float(at) - float(rng.uniform(0.0, 0.01)) * domain.size, 4)
-
-    def _distinct(self, rng: np.random.Generator, between: bool) -> Location:
-        """A random named point, or pair of points, whose modal force vector is not nearly parallel to another one.
-
-        A force at a place with a parallel vector (weighted by the modal velocities) and another strength explains the
-        records equally well, so that the place of an effect would not be identifiable.
-        """
-        modes = self.rig.modes
-        points = modes.domain
-        assert isinstance(points, NamedPoints)
-        alone, pairs = list(points.grid()), list(points.pairs())
-        index = {name: i for i, name in enumerate(alone)}
-        at_points = modes.phi(alone) * np.sqrt(np.mean(self.moved[1] ** 2, axis=0))
-        ends = np.array([[index[str(pair.first)], index[str(pair.second)]] for pair in pairs]).reshape(-1, 2)
-        felt = np.vstack([at_points, at_points[ends[:, 0]] - at_points[ends[:, 1]]])
-        size = np.linalg.norm(felt, axis=1)
-        places: list[Location] = [*alone, *pairs]
-        wanted = np.arange(size.size) >= len(alone) if between else np.arange(size.size) < len(alone)
-        lively = np.flatnonzero(wanted & (size > size[wanted].max() / 3))
-        unit = felt / np.maximum(size, 1e-300)[:, None]
-        for i in map(int, rng.permutation(lively)):
-            cosine = np.abs(unit @ unit[i])
-            cosine[i] = 0.0
-            if np.sqrt(np.maximum(1.0 - cosine.max() ** 2, 0.0)) > DISTINCT:
-                return places[i]
-        raise Unsuitable("no two places are distinguishable by their mode shapes")
-
-    def gap(self, plant: Plant, rng: np.random.Generator, reference: Plant | None = None) -> float:
-        """Noise-free gap between a plant and the nominal one (or the reference) at the middle level.
-
-        Raises:
-            Unsuitable: the response diverges.
-        """
-        measured = self._readings(plant, rng)
-        predicted = self.outputs if reference is None else self._readings(reference, rng)
-        gap = relative_gap(measured - predicted, measured)
-        if not np.isfinite(gap):
-            raise Unsuitable("the response diverges")
-        return gap
-
-    def _readings(self, plant: Plant, rng: np.random.Generator) -> np.ndarray:
-        solved, own = plant.solved(), np.random.default_rng(rng.integers(2**31))
-        moved, _ = solved.move(self.commands, self.bench.sample_time, rng=own, finest=COARSE)
-        return solved.readings(moved, self.bench.sample_time)

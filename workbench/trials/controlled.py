@@ -23,7 +23,6 @@ class PlantResponse:
         effort: ∫ FᵀF dt.
         peak_force: largest force of any actuator, N.
         bounded: whether the energy stayed below a million times that of the impulse.
-        sample_time: s.
         outputs: (n_outputs, n_samples) readings of the controller's sensors.
     """
 
@@ -54,8 +53,7 @@ class PlantResponse:
     def settling(self, modes: int | None = None) -> float | None:
         """Time after which the energy stays below a hundredth of its peak, s; None if it does not within the test.
 
-        Args:
-            modes: number of modes whose energy is summed, lowest first; all unless given.
+        Of the energy of that many modes, lowest first; of all unless given.
         """
         time = settling(self.modal_energy[:modes].sum(axis=0), self.sample_time)
         return time if self.bounded and np.isfinite(time) else None
@@ -73,7 +71,6 @@ def control_plant(
     """The response of the plant to an impulse at one of its inputs, under control.
 
     Args:
-        real: the plant.
         controller: its sensors and actuators are those of the plant of the same names.
         n_samples: length of the test, at the controller's sample time.
         impulse_input: name of the input at which the impulse acts.
@@ -85,7 +82,10 @@ def control_plant(
     system, pieces = real.system, real.pieces(dt)
     inputs = [a.name for a in plant.actuators]
     commanded = [inputs.index(name) for name in controller.actuators]
-    reading = _Reading(real, controller, n_samples, pieces.edges, rng)
+    noise = np.zeros((len(plant.sensors), n_samples))
+    if rng is not None:
+        noise = np.array([s.noise_std * sensor_noise(rng, n_samples, plant.noise_memory) for s in plant.sensors])
+    reading = _Reading(real, controller, noise)
     held = real.random_forces(n_samples, dt, rng)
     state = motion.at_rest(system, n_samples)
     displacement, velocity = state.y[:n], state.y[n : 2 * n]
@@ -111,40 +111,25 @@ def control_plant(
 class _Reading:
     """The readings of the controller's sensors, sample by sample; `SolvedPlant.readings` does this for a record."""
 
-    def __init__(
-        self,
-        real: SolvedPlant,
-        controller: DigitalController,
-        n_samples: int,
-        edges: np.ndarray,
-        rng: np.random.Generator | None,
-    ):
-        plant = real.plant
-        names = [s.name for s in plant.sensors]
+    def __init__(self, real: SolvedPlant, controller: DigitalController, noise: np.ndarray):
+        names, self.dt, self.noise = [s.name for s in real.plant.sensors], controller.sample_time, noise
         self.read = [names.index(name) for name in controller.sensors]
-        self.sensors, self.shapes, self.laws = plant.sensors, real.at_sensors, plant.reading_laws
-        self.dt, self.n_samples, self.starts = controller.sample_time, n_samples, np.r_[0.0, edges[:-1]]
-        self.truth, self.noise = np.zeros((2, len(names), n_samples))
-        self.lagged, self.before = np.zeros((2, len(names)))
-        if rng is not None:
-            for row, sensor in zip(self.noise, plant.sensors, strict=True):
-                row[:] = sensor.noise_std * sensor_noise(rng, n_samples, plant.noise_memory)
+        self.sensors, self.shapes, self.laws = real.plant.sensors, real.at_sensors, real.plant.reading_laws
+        self.starts = np.r_[0.0, real.pieces(self.dt).edges[:-1]]
+        self.truth, (self.lagged, self.before) = np.zeros(noise.shape), np.zeros((2, len(names)))
 
     def at(self, k: int, y: np.ndarray, moved: np.ndarray) -> np.ndarray:
         """The readings at sample k, from the state y there and the motion before it."""
         n = self.shapes.shape[1]
         for j, sensor in enumerate(self.sensors):
             order = MEASURED[sensor.quantity][1]
-            late = np.round(sensor.delay / self.dt, 12)
-            if order > 1:
-                continue
-            if late <= 0:  # in real time a reading cannot be ahead of the clock
-                self.truth[j, k] = self.shapes[j] @ y[order * n : (order + 1) * n]
-                continue
+            late = max(np.round(sensor.delay / self.dt, 12), 0.0)  # in real time a reading is never ahead of the clock
             whole = int(np.ceil(late))
-            if k >= whole:
-                piece = int(np.argmin(np.abs(self.starts - (whole - late))))
-                self.truth[j, k] = self.shapes[j] @ moved[k - whole, order, piece]
+            if order > 1 or k < whole:
+                continue
+            piece = int(np.argmin(np.abs(self.starts - (whole - late))))
+            then = moved[k - whole, order, piece] if whole else y[order * n : (order + 1) * n]
+            self.truth[j, k] = self.shapes[j] @ then
         truth = self.truth[:, : k + 1]
         for law in self.laws:
             truth = law(truth, self.dt)
@@ -155,5 +140,5 @@ class _Reading:
         if sensor.time_constant > 0:
             before, self.before[j] = self.before[j], y
             self.lagged[j] = y = lagged(self.lagged[j], before, y, sensor.time_constant, self.dt) if k else y
-        y = float(measured(sensor, y, k, self.n_samples, self.noise[j, k]))
+        y = float(measured(sensor, y, k, self.noise.shape[1], self.noise[j, k]))
         return float(sensor.step * np.round(y / sensor.step)) if sensor.step > 0 else y

@@ -57,8 +57,7 @@ class Alterations:
 
 
 AS_NOMINAL = Alterations()
-# (stiffness_waves, mass_waves) -> the matrices of a frame with this variation
-Frame = Callable[[Sequence[float], Sequence[float]], FiniteElements]
+Frame = Callable[..., FiniteElements]  # stiffness_waves=, mass_waves= -> the matrices of a frame with this variation
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,8 +188,7 @@ def _dense_modes(
 def _nodes(special: np.ndarray, length: float, apart: float) -> np.ndarray:
     """Evenly spaced nodes and the special ones; an even node near a special one is dropped, to avoid tiny elements.
 
-    Args:
-        apart: of the length; special places that are closer share a node.
+    Special places that are closer than a share `apart` of the length share a node.
     """
     special = np.unique(np.r_[0.0, special[(special > 0) & (special < length)], length])
     special = special[np.r_[True, np.diff(special) > apart * length]]

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from workbench.arrays import Floats
-from workbench.rig.rig import Transducer
 from workbench.structure.domain import Between, centred_at
 from workbench.trials.laws import POINT_LAWS, PointLaw
 from workbench.trials.plant import Plant
@@ -35,12 +34,9 @@ def _law(law: PointLaw, plant: Plant, e: dict[str, Any]) -> Plant:
 
 def _with_transducers(plant: Plant, side: str, name: str, **changes: Any) -> Plant:
     """The plant with one actuator or sensor changed, or all of them (except hammers) for the name "all"."""
-
-    def meant(transducer: Transducer) -> bool:
-        return transducer.name == name or (name == "all" and not getattr(transducer, "direct", False))
-
     transducers: Any = tuple(
-        replace(transducer, **changes) if meant(transducer) else transducer for transducer in getattr(plant, side)
+        replace(t, **changes) if t.name == name or (name == "all" and not getattr(t, "direct", False)) else t
+        for t in getattr(plant, side)
     )
     return replace(plant, **{side: transducers})
 

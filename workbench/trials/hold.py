@@ -13,10 +13,11 @@ import numpy as np
 from workbench.cases.case import Case, read_case
 from workbench.cases.writing import write_case
 from workbench.gap.diagnose_case import diagnose_case
-from workbench.trials.imperfections import CLEAN, IMPERFECTIONS, MIMICS, SIZES, TRIPLE
+from workbench.renamed import Renamed
+from workbench.trials.imperfections import CLEAN, IMPERFECTIONS, INDISTINGUISHABLE, SIZES, TRIPLE
 from workbench.trials.make import KINDS, OUTSIDE_KINDS, check_kinds, find_trial_with_plant
 from workbench.trials.rigs import FRAMES, MEMBERS, PLATES
-from workbench.trials.scoring import Tally, score, score_imperfect, tally
+from workbench.trials.scoring import Statistics, score, score_imperfect, statistics
 
 MOST_SEEDS = 100
 
@@ -32,10 +33,7 @@ OF_MEMBERS = frozenset({"local_stiffness_loss", "support_rotation", "axial_load"
 NOT_ON = {MEMBERS: frozenset(), PLATES: OF_MEMBERS, FRAMES: OF_MEMBERS | {"truncated_modes"}}
 
 # Kinds that the records of a case cannot distinguish.
-ALIKE = (
-    {"actuator_lag", "actuator_delay", "sensor_lag", "sensor_delay"},
-    {"modulus_error", "stiffness_drift"},
-)
+ALIKE = ({"actuator_lag", "actuator_delay", "sensor_lag", "sensor_delay"}, {"modulus_error", "stiffness_drift"})
 
 
 class ImperfectDraw(NamedTuple):
@@ -76,19 +74,16 @@ def draw_imperfect_kinds(
         size: of the imperfections; None for each of `SIZES` in turn.
     """
     rng = np.random.default_rng(seed)
+    classes = IMPERFECTIONS if imperfections == "all" else (imperfections,)
     drawn: list[ImperfectDraw] = []
     for i in range(n):
-        name = IMPERFECTIONS[i % len(IMPERFECTIONS)] if imperfections == "all" else imperfections
-        turn = i // len(IMPERFECTIONS) if imperfections == "all" else i
-        how_large = SIZES[turn % len(SIZES)] if size is None else size
-        pool = [k for k in COMMON_KINDS if k not in MIMICS[name]]
+        turn, name = i // len(classes), classes[i % len(classes)]
+        pool = [k for k in COMMON_KINDS if k not in INDISTINGUISHABLE[name]]
         if name == TRIPLE:
             kinds = tuple(sorted(_draw_several(3, pool, rng)))
-        elif (turn // len(SIZES) + turn) % 3 == 2:
-            kinds = ()
         else:
-            kinds = (str(rng.choice(pool)),)
-        drawn.append(ImperfectDraw(name, how_large, kinds))
+            kinds = () if (turn // len(SIZES) + turn) % 3 == 2 else (str(rng.choice(pool)),)
+        drawn.append(ImperfectDraw(name, SIZES[turn % len(SIZES)] if size is None else size, kinds))
     return drawn
 
 
@@ -139,18 +134,10 @@ def write_trials(
         draws = [draw._replace(kinds=tuple(hidden)) for draw, hidden in zip(draws, kinds, strict=True)]
     labelled = {}
     for i, draw in enumerate(draws):
-        name = f"case-{i + 1:03d}"
-        barred = MIMICS[draw.imperfections] | NOT_ON[structure] | {"truncated_modes"}
-        pool = [k for k in COMMON_KINDS if k not in barred]
-        case, labelled[name], _ = find_trial_with_plant(
-            np.random.default_rng([seed, i]),
-            others=pool,
-            tries=MOST_SEEDS,
-            like=like,
-            structure=structure,
-            name=name,
-            **draw._asdict(),
-        )
+        name, rng = f"case-{i + 1:03d}", np.random.default_rng([seed, i])
+        barred = INDISTINGUISHABLE[draw.imperfections] | NOT_ON[structure] | {"truncated_modes"}
+        how = {"others": [k for k in COMMON_KINDS if k not in barred], "tries": MOST_SEEDS, **draw._asdict()}
+        case, labelled[name], _ = find_trial_with_plant(rng, like=like, structure=structure, name=name, **how)
         write_case(case, folder / name)
         report(name, (i + 1) / n)
     labels.parent.mkdir(parents=True, exist_ok=True)
@@ -162,25 +149,30 @@ class Trials:
     """The results of blind trials.
 
     Attributes:
-        verdicts: by case, as JSON.
-        labels: by case.
-        scores: by case.
+        verdicts, labels, scores: by case, as JSON.
         imperfect_scores: by case, see `score_imperfect`; empty without imperfections.
-        tally: of all scores.
+        statistics: of all scores.
     """
 
     verdicts: dict[str, dict[str, Any]]
     labels: dict[str, dict[str, Any]]
     scores: dict[str, dict[str, Any]]
     imperfect_scores: dict[str, dict[str, Any]]
-    tally: Tally
+    statistics: Statistics
+
+    tally = Renamed("statistics")
+
+
+def verdict_on(folder: Path) -> dict[str, Any]:
+    """The verdict on a case folder, as JSON, by one process."""
+    return diagnose_case(read_case(folder), workers=1).to_json()
 
 
 def hold_trials(
     n: int,
     seed: int,
     *,
-    diagnose_case: Callable[[Path], dict[str, Any]] | None = None,
+    diagnose_case: Callable[[Path], dict[str, Any]] = verdict_on,
     report: Callable[[str, float], None] = lambda text, share: None,
     **hidden: Any,
 ) -> Trials:
@@ -190,7 +182,7 @@ def hold_trials(
     contains no labels.
 
     Args:
-        diagnose_case: folder -> verdict as JSON; None for the diagnosis of this package.
+        diagnose_case: folder -> verdict as JSON.
         report: called with (text, share done).
         hidden: `like`, `structure`, `kinds`, `imperfections` and `size` of `write_trials`.
     """
@@ -202,15 +194,14 @@ def hold_trials(
         verdicts, scores, imperfect = {}, {}, {}
         folders = sorted(Path(cases).iterdir())
         for i, folder in enumerate(folders):
-            verdicts[folder.name] = (diagnose_case or verdict_on)(folder)
+            verdicts[folder.name] = diagnose_case(folder)
             report(f"diagnosed {folder.name}", 0.1 + 0.9 * (i + 1) / n)
         for folder in folders:
-            domain = read_case(folder).rig.modes.domain
-            verdict, label = verdicts[folder.name], labels[folder.name]
-            scores[folder.name] = score(verdict, label, domain=domain)
+            pair, domain = (verdicts[folder.name], labels[folder.name]), read_case(folder).rig.modes.domain
+            scores[folder.name] = score(*pair, domain=domain)
             if hidden.get("imperfections") is not None:
-                imperfect[folder.name] = score_imperfect(verdict, label, domain=domain)
-    return Trials(verdicts, labels, scores, imperfect, tally(scores.values()))
+                imperfect[folder.name] = score_imperfect(*pair, domain=domain)
+    return Trials(verdicts, labels, scores, imperfect, statistics(scores.values()))
 
 
 def hold_one(seed: int, kinds: Sequence[str], **hidden: Any) -> dict[str, Any]:
@@ -225,10 +216,3 @@ def processor_times(trials: Iterable[Mapping[str, Any]]) -> dict[str, float]:
     """Median, ninth decile and maximum of the processor times of `hold_one`, s."""
     times = np.quantile([trial["processor"] for trial in trials], (0.5, 0.9, 1.0)).round(1).tolist()
     return dict(zip(("median", "nine of ten", "longest"), times, strict=True))
-
-
-def verdict_on(folder: Path) -> dict[str, Any]:
-    """The verdict on a case folder, as JSON, by one process."""
-    case = read_case(folder)
-    verdict = diagnose_case(case, workers=1)
-    return verdict.to_json()

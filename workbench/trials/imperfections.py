@@ -29,7 +29,7 @@ CALIBRATION = 0.01  # standard deviation of the gain of each actuator and each s
 PLACED = 0.002  # standard deviation of the place of each, in each coordinate, over the extent: 4 mm of 2 m
 
 # Effects that cannot be distinguished from the imperfections of a class.
-MIMICS: dict[str, frozenset[str]] = {
+INDISTINGUISHABLE: dict[str, frozenset[str]] = {
     CLEAN: frozenset(),
     "shape": frozenset({"modulus_error", "modal_damping", "axial_load", "truncated_modes"}),
     "offset": frozenset({"modulus_error", "modal_damping", "stiffness_drift"}),
@@ -41,7 +41,7 @@ MIMICS: dict[str, frozenset[str]] = {
     "place": frozenset({"actuator_misplacement", "sensor_misplacement"}),
     TRIPLE: frozenset(),
 }
-MIMICS["mixed"] = frozenset().union(*(MIMICS[name] for name in MIXED))
+INDISTINGUISHABLE["mixed"] = frozenset().union(*(INDISTINGUISHABLE[name] for name in MIXED))
 
 
 def with_imperfections(plant: Plant, name: str, size: float, bench: Bench, rng: np.random.Generator) -> Plant:
@@ -94,20 +94,15 @@ def _with_part(plant: Plant, name: str, size: float, bench: Bench, rng: np.rando
         return replace(plant, actuators=_each(actuators, gain=gains[:n]), sensors=_each(sensors, gain=gains[n:]))
     if name == "place" and not isinstance(domain, NamedPoints):
         places = _off_places(domain, [transducer.at for transducer in transducers], PLACED * size, rng)
-        return replace(
-            plant,
-            actuators=_each(actuators, at=places[:n]),
-            sensors=_each(sensors, at=[middle(at) for at in places[n:]]),
-        )
+        read_at = [middle(at) for at in places[n:]]
+        return replace(plant, actuators=_each(actuators, at=places[:n]), sensors=_each(sensors, at=read_at))
     return plant
 
 
 def _each(transducers: Any, **values: list[Any]) -> Any:
     """The actuators or sensors with a value of each field for each of them."""
-    return tuple(
-        replace(transducer, **{name: each[i] for name, each in values.items()})
-        for i, transducer in enumerate(transducers)
-    )
+    rows = (dict(zip(values, row)) for row in zip(*values.values(), strict=True))
+    return tuple(replace(transducer, **row) for transducer, row in zip(transducers, rows, strict=True))
 
 
 def _off_places(

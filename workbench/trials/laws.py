@@ -12,6 +12,7 @@ from numba import njit
 
 DAMPER, CUBIC, CLEARANCE, STOP, FRICTION, BOUC_WEN, QUADRATIC, QUINTIC, CUBIC_DAMPER, SQUEEZE, MAGNET = range(11)
 SLIDING, QUADRATIC_DAMPER = range(11, 13)
+BOTH_WAYS = ("force_forward", "force_backward")
 
 
 @njit(cache=True)
@@ -91,21 +92,14 @@ def _friction(p: PointSizes, rng: np.random.Generator) -> Strengths:
 
 def _two_way_friction(p: PointSizes, rng: np.random.Generator) -> Strengths:
     speed, ratio = float(rng.uniform(0.01, 0.05)) * p.velocity, float(rng.uniform(0.3, 0.8))
-    names = ("force_forward", "force_backward")
-    stronger, weaker = names if rng.random() < 0.5 else names[::-1]
-
-    def law(s: float) -> dict[str, float]:
-        force = 0.02 * s * p.force
-        return {stronger: force, weaker: ratio * force, "smoothing_speed": speed}
-
-    return law
+    stronger, weaker = BOTH_WAYS if rng.random() < 0.5 else BOTH_WAYS[::-1]
+    return lambda s: {stronger: 0.02 * s * p.force, weaker: ratio * (0.02 * s * p.force), "smoothing_speed": speed}
 
 
 def _same_both_ways(e: Label) -> Label:
     """Friction with the mean of both forces; it differs from two-way friction by a constant force."""
-    both = "force_forward", "force_backward"
-    rest = {name: value for name, value in e.items() if name not in both}
-    return {**rest, "kind": "coulomb_friction", "force": 0.5 * sum(e[name] for name in both)}
+    rest = {name: value for name, value in e.items() if name not in BOTH_WAYS}
+    return {**rest, "kind": "coulomb_friction", "force": 0.5 * sum(e[name] for name in BOTH_WAYS)}
 
 
 def _bouc_wen(p: PointSizes, rng: np.random.Generator) -> Strengths:
@@ -129,17 +123,14 @@ def _power(name: str, share: float, of_displacement: float, of_velocity: float =
     return draw
 
 
-CONTACT = ("stiffness", "gap")
 POINT_LAWS: dict[str, PointLaw] = {
     "point_damper": PointLaw(DAMPER, ("coefficient",)),
     "cubic_spring": PointLaw(CUBIC, ("stiffness",), _power("stiffness", 0.1, 3)),
-    "clearance": PointLaw(CLEARANCE, CONTACT, _clearance),
-    "one_sided_stop": PointLaw(STOP, CONTACT, _clearance),
+    "clearance": PointLaw(CLEARANCE, ("stiffness", "gap"), _clearance),
+    "one_sided_stop": PointLaw(STOP, ("stiffness", "gap"), _clearance),
     "coulomb_friction": PointLaw(FRICTION, ("force", "smoothing_speed"), _friction),
     "bouc_wen": PointLaw(BOUC_WEN, ("stiffness", "yield_displacement"), _bouc_wen),
-    "two_way_friction": PointLaw(
-        SLIDING, ("force_forward", "force_backward", "smoothing_speed"), _two_way_friction, limit=_same_both_ways
-    ),
+    "two_way_friction": PointLaw(SLIDING, (*BOTH_WAYS, "smoothing_speed"), _two_way_friction, limit=_same_both_ways),
     "quadratic_damper": PointLaw(QUADRATIC_DAMPER, ("coefficient",), _power("coefficient", 0.05, 0, 2)),
     "quadratic_spring": PointLaw(QUADRATIC, ("stiffness",), _power("stiffness", 0.1, 2), outside=True),
     "quintic_spring": PointLaw(QUINTIC, ("stiffness",), _power("stiffness", 0.05, 5), outside=True),

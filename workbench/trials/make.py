@@ -9,17 +9,8 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.cases.case import Case
 from workbench.structure.domain import NamedPoints
-from workbench.trials.benches import (
-    Bench,
-    Scene,
-    Unsuitable,
-    bench_of,
-    draw_bench,
-    experiments,
-    relative_gap,
-    tested,
-)
-from workbench.trials.draws import draw_effect
+from workbench.trials.benches import Bench, Unsuitable, bench_of, draw_bench, experiments, relative_gap, tested
+from workbench.trials.draws import NominalMotion, draw_effect
 from workbench.trials.hidden import HIDE, NONE, OUTSIDE, UNKNOWN, hide
 from workbench.trials.imperfections import CLEAN, IMPERFECTIONS, with_imperfections
 from workbench.trials.laws import POINT_LAWS
@@ -37,8 +28,7 @@ STRONG = 0.7  # least gap of the effects, over the gap of the imperfections
 
 def make_trial(seed: int, **how: Any) -> tuple[Case, dict[str, Any]]:
     """The case and the label of `make_trial_with_plant`, with the same arguments."""
-    case, label, _ = make_trial_with_plant(seed, **how)
-    return case, label
+    return make_trial_with_plant(seed, **how)[:2]
 
 
 def make_trial_with_plant(
@@ -58,7 +48,6 @@ def make_trial_with_plant(
         kinds: of `KINDS` or `OUTSIDE_KINDS`; none for a real structure equal to the nominal one.
         like: a case whose nominal rig, levels, band, noise and records are taken; None draws a bench.
         structure: of a drawn bench: "members" (beams and rods), "plates" or "frames".
-        name: of the case.
         imperfections: class of small additional errors, of `IMPERFECTIONS`.
         size: of these errors, 1 for those of a careful laboratory.
 
@@ -74,7 +63,6 @@ def make_trial_with_plant(
         raise ValueError(f"imperfections must be one of {', '.join(IMPERFECTIONS)}; got {imperfections!r}")
     check_kinds(kinds)
     rng = np.random.default_rng(seed)
-    reason = ""
     for _ in range(MOST_BENCHES if like is None else MOST_DRAWS):
         try:
             bench = draw_bench(rng, structure) if like is None else bench_of(like)
@@ -85,7 +73,7 @@ def make_trial_with_plant(
             case, label, real = _case(bench, tests, effects, (plain, imperfect), rng, name)
             return case, {**label, "class": imperfections, "size": size}, real
         except Unsuitable as error:
-            reason = str(error)
+            reason = error
     raise ValueError(f"no case with {' and '.join(kinds)} could be generated on this bench; the last draw: {reason}")
 
 
@@ -104,9 +92,9 @@ def _draw_effects(
         bench, effect = _truncate(bench, rng)
         effects.append(effect)
     if kinds:
-        scene = Scene.of(bench, commands)
-        effects += [draw_effect(kind, scene, rng) for kind in kinds if kind != "truncated_modes"]
-        _check_each_seen(scene, effects, rng)
+        nominal = NominalMotion.of(bench, commands)
+        effects += [draw_effect(kind, nominal, rng) for kind in kinds if kind != "truncated_modes"]
+        _check_each_seen(nominal, effects, rng)
     return bench, effects
 
 
@@ -120,13 +108,13 @@ def _truncate(bench: Bench, rng: np.random.Generator) -> tuple[Bench, dict[str, 
     return replace(bench, rig=rig), {"kind": "truncated_modes", "kept": kept, "needed": modes.n_modes}
 
 
-def _check_each_seen(scene: Scene, effects: list[dict[str, Any]], rng: np.random.Generator) -> None:
-    nominal = scene.bench.plant()
+def _check_each_seen(nominal: NominalMotion, effects: list[dict[str, Any]], rng: np.random.Generator) -> None:
+    plant = nominal.bench.plant()
     for one in effects:
         if one["kind"] == "sensor_quantisation":
             continue
-        rest = [e for e in effects if e is not one]
-        gap = scene.gap(hide(nominal, effects), rng, reference=hide(nominal, rest))
+        without = hide(plant, [e for e in effects if e is not one])
+        gap = nominal.gap(hide(plant, effects), rng, reference=without)
         if (len(effects) > 1 and gap < SEEN) or gap > 5.0:
             raise Unsuitable(f"{one['kind']}, added to the other effects, alters the response by {gap:.2g}")
         if one["kind"] == "truncated_modes" and gap < 0.01:
@@ -167,11 +155,11 @@ def _case(
         }
     _check_visible([figures[test] for test in fitted], effects)
     outside = [{"kind": UNKNOWN, "outside": e["kind"]} for e in effects if e["kind"] in OUTSIDE]
-    domain = bench.rig.modes.domain
     # share of the mean square of the nominal residual that noise makes; the residual of the exact model under random
     # forces or input noise counts as explained: nothing is unexplained
-    held = figures["validate"]
-    noise_share = min(held["noise_floor"], held["true_model"]) ** 2 / held["gap"] ** 2
+    of_validation = figures["validate"]
+    noise_share = min(of_validation["noise_floor"], of_validation["true_model"]) ** 2 / of_validation["gap"] ** 2
+    domain = bench.rig.modes.domain
     label = {
         "title": name,
         "snr_db": bench.snr_db,
@@ -193,15 +181,13 @@ def _check_strong(
 ) -> None:
     """Require a record to fit in which the effects are visible and at least `STRONG` times the imperfections.
 
-    Weaker effects cannot be named: they alter the readings by less than a diagnosis explains.
-
-    Args:
-        plants: the nominal one, the one with imperfections, and the one with effects too.
+    Weaker effects cannot be named: they alter the readings by less than a diagnosis explains. The plants are the
+    nominal one, the one with imperfections, and the one with effects too.
     """
     gaps, ratios = [], []
-    for test, commands in fitted.items():
+    for test in fitted.items():
         nominal, imperfect, real = (
-            _noise_free(plant, bench, test, commands, np.random.default_rng(rng.integers(2**31))) for plant in plants
+            _noise_free(plant, bench, *test, np.random.default_rng(rng.integers(2**31))) for plant in plants
         )
         if not np.isfinite([nominal, imperfect, real]).all():
             raise Unsuitable("the response diverges")
@@ -227,11 +213,9 @@ def _check_distinct(
         simpler = hide(imperfect, [law.limit(e) if e is one else e for e in effects]).solved()
         noise = np.array([[sensor.noise_std] for sensor in real.plant.sensors])
         squares = []
-        for test, commands in fitted.items():
+        for test in fitted.items():
             # the same random forces on both
-            y, without = (
-                _noise_free(plant, bench, test, commands, np.random.default_rng(0)) for plant in (real, simpler)
-            )
+            y, without = (_noise_free(plant, bench, *test, np.random.default_rng(0)) for plant in (real, simpler))
             squares.append(np.mean(((y - without) / noise) ** 2))
         difference = float(np.sqrt(np.mean(squares)))
         if not difference > DISTINCT:
@@ -240,8 +224,7 @@ def _check_distinct(
 
 def _noise_free(plant: SolvedPlant, bench: Bench, test: str, commands: Floats, rng: np.random.Generator) -> np.ndarray:
     """Readings in one of the experiments, under random forces but without the sensors' noise."""
-    moved, _ = tested(plant, bench, test, commands, rng)
-    return plant.readings(moved, bench.sample_time)
+    return plant.readings(tested(plant, bench, test, commands, rng)[0], bench.sample_time)
 
 
 def _rounded(effects: list[dict[str, Any]]) -> bool:
@@ -250,10 +233,8 @@ def _rounded(effects: list[dict[str, Any]]) -> bool:
 
 def _logged(sent: Floats, noise: float, rng: np.random.Generator) -> Floats:
     """The logged inputs, with noise of this share of their rms; an input at rest has none."""
-    if noise == 0:
-        return sent
     rms: Floats = np.sqrt(np.mean(sent**2, axis=1, keepdims=True))
-    return sent + noise * rms * rng.standard_normal(sent.shape)
+    return sent + noise * rms * rng.standard_normal(sent.shape) if noise else sent
 
 
 def _check_visible(figures: Sequence[dict[str, float]], effects: list[dict[str, Any]]) -> None:

@@ -16,14 +16,7 @@ from workbench.structure.domain import Location
 from workbench.structure.member import Structure
 from workbench.structure.plate import Plate
 from workbench.trials import motion
-from workbench.trials.finite_elements import (
-    Alterations,
-    ElementModes,
-    Frame,
-    element_modes,
-    matrix_modes,
-    modal_modes,
-)
+from workbench.trials.finite_elements import Alterations, ElementModes, Frame, element_modes, matrix_modes, modal_modes
 from workbench.trials.plate_elements import plate_modes
 
 FINEST = 0.05  # radians of the highest mode in one step
@@ -36,8 +29,7 @@ class Plant:
 
     Attributes:
         nominal: the nominal rig.
-        actuators, sensors: the real ones, in the nominal order.
-        n_modes: number of modes of the real structure.
+        actuators, sensors, n_modes: the real ones, in the nominal order.
         frame: makes the matrices behind nominal modes at named points; None for a member, a plate or modal data.
         altered: differences of the structure from the nominal one.
         damping_factor: of every damping ratio.
@@ -135,7 +127,7 @@ class Plant:
         if isinstance(structure, Plate):
             return plate_modes(structure, places, self.n_modes, altered=self.altered)
         if self.frame is not None:
-            frame = self.frame(self.altered.stiffness_waves, self.altered.mass_waves)
+            frame = self.frame(stiffness_waves=self.altered.stiffness_waves, mass_waves=self.altered.mass_waves)
             altered = replace(self.altered, stiffness_waves=(), mass_waves=())
             return matrix_modes(frame, places, self.n_modes, altered=altered)
         return modal_modes(self.nominal.modes, places, altered=self.altered)
@@ -143,9 +135,9 @@ class Plant:
     def _damping_ratios(self) -> Floats:
         """The damping ratio of each mode; modes above the nominal ones have the last nominal ratio."""
         zeta, factors = self.nominal.modes.zeta, np.ones(self.n_modes)
-        padded: Floats = np.r_[zeta, np.full(max(self.n_modes - zeta.size, 0), zeta[-1])][: self.n_modes]
         known = self.damping_factors[: self.n_modes]
         factors[: len(known)] = known
+        padded: Floats = zeta[np.minimum(np.arange(self.n_modes), zeta.size - 1)]
         return self.damping_factor * factors * padded
 
 
@@ -222,9 +214,8 @@ class SolvedPlant:
 
     def truth(self, moved: ModalMotion, sample_time: float) -> np.ndarray:
         """The readings (n_outputs, n_samples) of perfect sensors, each with its delay and then shares of others."""
-        sensors = self.plant.sensors
+        sensors, names = self.plant.sensors, [sensor.name for sensor in self.plant.sensors]
         y = [self._true(j, sensor, moved, sample_time) for j, sensor in enumerate(sensors)]
-        names = [sensor.name for sensor in sensors]
         for output, source, share in self.plant.crosstalk:
             j, i = names.index(output), names.index(source)
             as_late = replace(sensors[i], delay=sensors[j].delay, interpolated=sensors[j].interpolated)
@@ -242,10 +233,8 @@ class SolvedPlant:
             older = np.r_[np.full(int(whole) + 1, each[0]), each]
             return np.asarray((1.0 - share) * older[1 : each.size + 1] + share * older[: each.size])
         back = np.round(-sensor.delay / sample_time, 12)
-        piece = int(np.argmin(np.abs(moved.starts - back % 1.0)))
-        shift = -int(np.floor(back))
-        read = moved.pieces[order, piece] @ shape
-        return np.asarray(np.r_[np.zeros(shift), read][: read.size])
+        read = moved.pieces[order, int(np.argmin(np.abs(moved.starts - back % 1.0)))] @ shape
+        return np.asarray(np.r_[np.zeros(-int(np.floor(back))), read][: read.size])
 
     def readings(self, moved: ModalMotion, sample_time: float, rng: np.random.Generator | None = None) -> np.ndarray:
         """The readings (n_outputs, n_samples) of the sensors; without `rng` their mean over the noise."""
@@ -256,10 +245,10 @@ class SolvedPlant:
         for sensor, row in zip(self.plant.sensors, y, strict=True):
             noise = 0.0 if rng is None else sensor.noise_std * sensor_noise(rng, row.size, self.plant.noise_memory)
             row = measured(sensor, _lag(row, sensor.time_constant, sample_time), np.arange(row.size), row.size, noise)
-            if sensor.step > 0:
-                mean = rng is None and sensor.noise_std > 0
-                rounded = sensor.step * np.round(row / sensor.step)
-                row = _mean_rounded(row, sensor.step, sensor.noise_std) if mean else rounded
+            if sensor.step > 0 and rng is None and sensor.noise_std > 0:
+                row = _mean_rounded(row, sensor.step, sensor.noise_std)
+            elif sensor.step > 0:
+                row = sensor.step * np.round(row / sensor.step)
             rows.append(row)
         return np.array(rows)
 

@@ -23,12 +23,11 @@ from workbench.trials.finite_elements import AS_NOMINAL, Alterations, BucklingEr
 ELEMENTS = 60  # along the longer side
 CROWDED = 0.7  # grading of the mesh towards the edges, for the singular corner of a clamped and a free edge; below 1
 ROUNDED = 0.05  # of the shift: a smaller ω² is rounding of the matrix of thousands of elements
-CUBICS = (  # of the coordinate t in an element: for value and slope at its left node, then at its right one
-    np.polynomial.Polynomial([1.0, 0.0, -3.0, 2.0]),
-    np.polynomial.Polynomial([0.0, 1.0, -2.0, 1.0]),
-    np.polynomial.Polynomial([0.0, 0.0, 3.0, -2.0]),
-    np.polynomial.Polynomial([0.0, 0.0, -1.0, 1.0]),
-)
+# of the coordinate t in an element: for value and slope at its left node, then at its right one
+CUBICS = [
+    np.polynomial.Polynomial(c)
+    for c in ((1.0, 0.0, -3.0, 2.0), (0.0, 1.0, -2.0, 1.0), (0.0, 0.0, 3.0, -2.0), (0.0, 0.0, -1.0, 1.0))
+]
 
 
 def plate_modes(

@@ -1,6 +1,7 @@
 """Random nominal rigs of blind trials: beams and rods, plates, and frames known at named points."""
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -25,18 +26,12 @@ PARTS = 6  # elements of a column or a floor; every other node is a named point
 
 
 def draw_rig(rng: np.random.Generator, structure: str) -> tuple[Rig, Frame | None]:
-    """A random nominal rig with noise-free sensors, and for a frame the function of its matrices.
-
-    Raises:
-        ValueError: a structure not in `STRUCTURES`.
-    """
-    if structure == MEMBERS:
-        return _member(rng), None
-    if structure == PLATES:
-        return _plate(rng), None
+    """A random nominal rig with noise-free sensors, and for a frame the function of its matrices."""
+    if structure not in STRUCTURES:
+        raise ValueError(f"trials are made on {', '.join(STRUCTURES)}; got {structure!r}")
     if structure == FRAMES:
         return _frame(rng)
-    raise ValueError(f"trials are made on {', '.join(STRUCTURES)}; got {structure!r}")
+    return _member(rng) if structure == MEMBERS else _plate(rng), None
 
 
 def _inputs(places: Sequence[Place], hammer: Place) -> tuple[Actuator, ...]:
@@ -59,10 +54,9 @@ def _member(rng: np.random.Generator) -> Rig:
     draw = (_long_beam, _tapered_beam, _ruler, _tapered_rod)[rng.integers(4)]
     structure, sensors = draw(rng)
     length = structure.length
-    n_actuators = int(rng.integers(2, 5))
-    places = (np.arange(1, n_actuators + 1) + rng.uniform(-0.3, 0.3, n_actuators)) * length / (n_actuators + 1)
-    places = np.round(places, 3)
-    strike = round(float(rng.uniform(0.35, 0.9)) * length, 3)
+    n = int(rng.integers(2, 5))
+    places = np.round((np.arange(1, n + 1) + rng.uniform(-0.3, 0.3, n)) * length / (n + 1), 3)
+    strike = float(places[0])  # until another place is drawn
     while np.abs(places - strike).min() < 0.03 * length:
         strike = round(float(rng.uniform(0.35, 0.9)) * length, 3)
     modes = structure.modes(int(rng.integers(12, 17)), tolerance=1e-9)
@@ -151,14 +145,12 @@ EDGES = (
 def _plate(rng: np.random.Generator) -> Rig:
     a = round(float(rng.uniform(0.9, 1.4)), 2)
     length = (a, round(float(rng.uniform(0.6, 0.9)) * a, 2))
-    # half of the plates are simply supported on all edges
-    edges = EDGES[max(int(rng.integers(-3, len(EDGES))), 0)]
     plate = Plate(
         length=length,
+        edges=EDGES[max(int(rng.integers(-3, len(EDGES))), 0)],  # half of them simply supported on all edges
         mass_per_area=round(float(rng.uniform(5.0, 12.0)), 2),
         bending_stiffness=round(float(rng.uniform(80.0, 300.0)), 1),
         poisson_ratio=round(float(rng.uniform(0.28, 0.34)), 2),
-        edges=edges,
         damping=_damping(rng),
     )
     n_actuators, n_sensors = int(rng.integers(2, 4)), int(rng.integers(6, 9))
@@ -182,7 +174,7 @@ def _scattered(rng: np.random.Generator, length: tuple[float, float], n: int) ->
 
 
 def _frame(rng: np.random.Generator) -> tuple[Rig, Frame]:
-    """A random portal frame of two or three storeys, clamped at its feet."""
+    """A portal frame of two or three storeys, clamped at its feet."""
     storeys = int(rng.integers(2, 4))
     width, height = (round(float(x), 2) for x in rng.uniform(0.3, 0.5, 2))
     column = Section.of_strip(0.03, float(rng.uniform(0.003, 0.005)), **STEEL)
@@ -201,12 +193,7 @@ def _frame(rng: np.random.Generator) -> tuple[Rig, Frame]:
         nodes |= {node: ((i + 1) / PARTS * width, k * height) for i, node in enumerate(inner)}
         strips += [(*ends, floor) for ends in pairwise([f"L{k}.{PARTS}", *inner, f"R{k}.{PARTS}"])]
         shown += inner[1::2]
-    damping = _damping(rng)
-
-    def frame(stiffness_waves: Sequence[float] = (), mass_waves: Sequence[float] = ()) -> FiniteElements:
-        variation = {"stiffness_waves": stiffness_waves, "mass_waves": mass_waves}
-        return plane_frame(nodes, strips, fixed=("L0", "R0"), damping=damping, **variation)
-
+    frame = partial(plane_frame, nodes, strips, fixed=("L0", "R0"), damping=_damping(rng))
     modes = _at_points(frame(), shown, int(rng.integers(14, 17)))
     across = [f"{node}.{'y' if node[0] == 'F' else 'x'}" for node in shown]
     n_actuators, n_sensors = int(rng.integers(2, 4)), int(rng.integers(7, 10))

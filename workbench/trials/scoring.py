@@ -17,6 +17,7 @@ NORMAL_95 = 1.96  # standard deviations on each side of a 95 % interval
 # kinds outside every catalogue when trials were sealed, and the effects that they have since become
 NAMED_SINCE = {"cross_talk": "actuator_crosstalk"}
 BINS = 5  # of a reliability diagram, of equal width
+FAMILIES = ("single", "pair", NONE, UNKNOWN)
 
 
 class Reliability(NamedTuple):
@@ -28,7 +29,7 @@ class Reliability(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Tally:
+class Statistics:
     """Statistics of a set of verdicts.
 
     Attributes:
@@ -72,7 +73,7 @@ def score(
     kinds = sorted(e["kind"] for e in named) in (sorted(e["kind"] for e in hidden), sorted(since))
     pairs = [(hidden[i], named[j]) for i, j in sorted(_pairs(hidden, named, domain))] if kinds else []
     channels = [_same_channel(h, t) for h, t in pairs if "input" in h or "output" in h]
-    errors = [_off(h, t, domain) for h, t in pairs if place_of(h) is not None and place_of(t) is not None]
+    errors = _position_errors(pairs, domain)
     return {
         "hidden": _words(hidden),
         "diagnosed": _words(named),
@@ -110,9 +111,8 @@ def score_imperfect(
     """
     hidden = [e for e in _hidden(label, inputs, outputs) if e["kind"] != UNKNOWN]
     named = [e for e in verdict["effects"] if e["kind"] != UNKNOWN]
-    pairs = [(hidden[i], named[j]) for i, j in _pairs(hidden, named, domain)]
-    pairs = [(h, t) for h, t in pairs if _same_channel(h, t)]
-    errors = [_off(h, t, domain) for h, t in pairs if place_of(h) is not None and place_of(t) is not None]
+    pairs = [(hidden[i], named[j]) for i, j in _pairs(hidden, named, domain) if _same_channel(hidden[i], named[j])]
+    errors = _position_errors(pairs, domain)
     covered = [inside for h, t in pairs for inside in _inside(h, t)]
     budget = verdict.get("budget", {}).get("unexplained")
     complete = len(pairs) == len(hidden) == len(named)
@@ -150,13 +150,11 @@ def reliability(scores: Iterable[dict[str, Any]]) -> list[Reliability]:
     """
     claims = np.array([claim for s in scores for claim in s["claims"]], float).reshape(-1, 2)
     ranges = np.minimum((claims[:, 0] * BINS).astype(int), BINS - 1)
-    there = [claims[ranges == k] for k in range(BINS)]
-    return [
-        Reliability(float(p.mean()), float(right.mean()), p.size) for p, right in (some.T for some in there) if p.size
-    ]
+    groups = (claims[ranges == k].T for k in range(BINS))
+    return [Reliability(float(p.mean()), float(right.mean()), p.size) for p, right in groups if p.size]
 
 
-def tally_imperfect(scores: Iterable[dict[str, Any]]) -> dict[str, float]:
+def imperfect_statistics(scores: Iterable[dict[str, Any]]) -> dict[str, float]:
     """Shares over many scores of `score_imperfect`.
 
     Returns:
@@ -196,7 +194,7 @@ def _hidden(label: dict[str, Any], inputs: Sequence[str], outputs: Sequence[str]
 def _pairs(hidden: list[dict[str, Any]], named: list[dict[str, Any]], domain: Domain | float) -> list[tuple[int, int]]:
     """Indices of a hidden and a named effect of the same kind, each used once: same channels first, then nearest."""
     alike = [
-        (not _same_channel(h, t), _off(h, t, domain), i, j)
+        (not _same_channel(h, t), sum(_position_errors([(h, t)], domain)), i, j)
         for i, h in enumerate(hidden)
         for j, t in enumerate(named)
         if h["kind"] == t["kind"]
@@ -208,18 +206,21 @@ def _pairs(hidden: list[dict[str, Any]], named: list[dict[str, Any]], domain: Do
     return pairs
 
 
-def _off(hidden: dict[str, Any], named: dict[str, Any], domain: Domain | float) -> float:
-    """The error of the named place of an effect, over the length or diagonal; 1 for another named point.
+def _position_errors(pairs: Iterable[tuple[dict[str, Any], dict[str, Any]]], domain: Domain | float) -> list[float]:
+    """The errors of the named places, over the length or diagonal; 1 for another named point.
 
     A mass acts in all directions of its node, so that any point of the node is right.
     """
-    places = as_domain(domain)
-    one, other = place_of(hidden), place_of(named)
-    if one is None or other is None:
-        return 0.0
-    if isinstance(places, NamedPoints) and hidden["kind"] == "point_mass":
-        return float(not set(places.translations(one)) & set(places.translations(other)))
-    return places.separation(one, other)
+    points, errors = as_domain(domain), []
+    for hidden, named in pairs:
+        one, other = place_of(hidden), place_of(named)
+        if one is None or other is None:
+            continue
+        if isinstance(points, NamedPoints) and hidden["kind"] == "point_mass":
+            errors.append(float(not set(points.translations(one)) & set(points.translations(other))))
+        else:
+            errors.append(points.separation(one, other))
+    return errors
 
 
 def _inside(hidden: dict[str, Any], named: dict[str, Any]) -> Iterable[bool]:
@@ -234,20 +235,14 @@ def _inside(hidden: dict[str, Any], named: dict[str, Any]) -> Iterable[bool]:
             yield from map(bool, np.abs(off) <= NORMAL_95 * np.atleast_1d(deviation))
 
 
-def tally(scores: Iterable[dict[str, Any]]) -> Tally:
+def statistics(scores: Iterable[dict[str, Any]]) -> Statistics:
     """The confusion matrix and shares of a set of scores."""
-    counts: Counter[tuple[str, str]] = Counter()
-    right: Counter[str] = Counter()
-    total: Counter[str] = Counter()
-    misplaced = placed = 0
-    for one in scores:
-        counts[one["hidden"], one["diagnosed"]] += 1
-        total[one["family"]] += 1
-        right[one["family"]] += one["kinds"]
-        misplaced += sum(error > NEAR for error in one["position_errors"])
-        placed += len(one["position_errors"])
-    shares = {family: (right[family], total[family]) for family in ("single", "pair", NONE, UNKNOWN) if total[family]}
-    return Tally(dict(counts), shares, misplaced, placed)
+    scores = list(scores)
+    counts = Counter((one["hidden"], one["diagnosed"]) for one in scores)
+    right = {family: [s["kinds"] for s in scores if s["family"] == family] for family in FAMILIES}
+    shares = {family: (sum(kinds), len(kinds)) for family, kinds in right.items() if kinds}
+    errors = [error for one in scores for error in one["position_errors"]]
+    return Statistics(dict(counts), shares, sum(error > NEAR for error in errors), len(errors))
 
 
 def _family(hidden: list[dict[str, Any]]) -> str:

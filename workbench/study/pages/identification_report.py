@@ -77,17 +77,15 @@ def identification_report(
             one with inputs; options of the other kind of data.
     """
     on: dict[str, Any] = {"seconds": seconds, "progress": progress}
-    frf = [one for one in measured if isinstance(one, FrequencyResponses)]
-    if frf:
+    most = MOST_MODES if n_modes is None else n_modes
+    frf = next((one for one in measured if isinstance(one, FrequencyResponses)), None)
+    if frf is not None:
         if len(measured) > 1:
             raise ValueError(f"FRFs are identified from one file; got {len(measured)} files")
         if start is not None or ambient:
             raise ValueError("FRFs have no time: leave --start and --ambient out; --band-hz sets a band")
-        one, most = frf[0], MOST_MODES if n_modes is None else n_modes
-        found = identify_frf(
-            one.values, one.frequencies_hz, channels=one.output_channels, band_hz=band_hz, max_modes=most, **on
-        )
-        return of_frfs(found, one)
+        on |= {"channels": frf.output_channels, "band_hz": band_hz, "max_modes": most}
+        return of_frfs(identify_frf(frf.values, frf.frequencies_hz, **on), frf)
     if band_hz is not None:
         raise ValueError("--band-hz is for FRFs; for a record, resample it or identify all its modes")
     records = [one for one in measured if isinstance(one, Record)]
@@ -98,7 +96,6 @@ def identification_report(
     for record in records:
         check_data_quality(record)
     if not ambient:
-        most = MOST_MODES if n_modes is None else n_modes
         return of_driven(identify_driven(records, max_modes=most, **on), records)
     if len(records) > 1 or records[0].n_inputs:
         remedy = "give one file" if len(records) > 1 else "leave --ambient out, to identify from the inputs"
@@ -163,14 +160,10 @@ def _model_of(found: DrivenModes) -> FrequencyResponses:
     lines = lines[(lines > 0.0) & (lines < nyquist)]
     s = 1j * TURN * lines
     hold = {"zero": "zoh", "first": "foh"}.get(found.input_hold)
-    values = (
-        found.state_space(s, squeeze=False)
-        if hold is None
-        else found.state_space.sample(dt, hold)(np.exp(s * dt), squeeze=False)
-    )
+    model, at = (found.state_space, s) if hold is None else (found.state_space.sample(dt, hold), np.exp(s * dt))
     late = np.exp(-s * found.delays[:, None])
     names = tuple(channel.name for channel in found.input_channels)
-    return FrequencyResponses(values * late, lines, found.output_channels, names)
+    return FrequencyResponses(model(at, squeeze=False) * late, lines, found.output_channels, names)
 
 
 def _on_convergence(converged: bool, remarks: Sequence[str], remedy: str) -> list[str]:
@@ -215,11 +208,8 @@ def of_frfs(found: FrfModes, measured: FrequencyResponses) -> IdentificationRepo
     doubt = SURE * found.omega_std / TURN + float(np.diff(found.frequencies_hz).min())
     hums = np.zeros(at.size, bool)
     for mains in MAINS_HZ:
-        hum = (
-            complex_shape
-            & (at > 0.5 * mains)
-            & (np.abs(at - mains * np.round(at / mains)) < np.minimum(doubt, 0.02 * mains))
-        )
+        near = np.abs(at - mains * np.round(at / mains)) < np.minimum(doubt, 0.02 * mains)
+        hum = complex_shape & (at > 0.5 * mains) & near
         lines += [f"mode {r + 1}: a multiple of {mains:g} Hz: mains hum?" for r in np.flatnonzero(hum)]
         hums |= hum
     unexplained = np.flatnonzero(complex_shape & ~doubtful & ~hums)
@@ -229,9 +219,8 @@ def of_frfs(found: FrfModes, measured: FrequencyResponses) -> IdentificationRepo
             " damping couples close modes, or data of roving sensors or hammers are inconsistent, and several of these"
             " modes are the same"
         )
-    band = found.frequencies_hz
-    outputs, inputs = found.modes.n_outputs, len(measured.references)
-    heading = f"FRFs of {counted(outputs, 'output')} and {counted(inputs, 'input')}"
+    band, channels = found.frequencies_hz, counted(found.modes.n_outputs, "output")
+    heading = f"FRFs of {channels} and {counted(len(measured.references), 'input')}"
     heading += f", {band.size} lines from {band[0]:.6g} to {band[-1]:.6g} Hz"
     content = {
         **_content(measured.output_channels, found),
@@ -256,12 +245,10 @@ def _report(
     content: dict[str, Any],
     decays: tuple[Record, ...] = (),
 ) -> IdentificationReport:
-    first = records[0]
-    samples = sum(record.n_samples for record in records)
+    first, samples = records[0], sum(record.n_samples for record in records)
     of = f" in {len(records)} records" if len(records) > 1 else ""
-    sensors = counted(first.n_outputs, "sensor")
     since = f" from {first.start_time:.6g} s on" if len(records) == 1 else ""
-    heading = f"{sensors}, {samples} samples{of} at {first.sample_rate_hz:.6g} Hz{since}"
+    heading = f"{counted(first.n_outputs, 'sensor')}, {samples} samples{of} at {first.sample_rate_hz:.6g} Hz{since}"
     return IdentificationReport(heading, tuple(rows_of(found)), tuple(lines), content, decays)
 
 
@@ -286,10 +273,8 @@ def _proportional(fit: ProportionalFit | None) -> list[str]:
     if fit.probability < UNLIKELY:
         worst = float(np.abs(fit.standardised_residuals).max())
         return [f"damping is not Rayleigh damping: ζ deviates from (α/ω + β ω)/2 by up to {worst:.0f} standard errors"]
-    (beta, beta_std), (alpha, alpha_std) = (
-        rounded(value, error)
-        for value, error in zip((fit.damping.stiffness, fit.damping.mass), fit.standard_errors, strict=True)
-    )
+    values = fit.damping.stiffness, fit.damping.mass
+    (beta, beta_std), (alpha, alpha_std) = map(rounded, values, fit.standard_errors)
     return [f"damping may be Rayleigh damping: α = {alpha} ± {alpha_std} 1/s, β = {beta} ± {beta_std} s"]
 
 

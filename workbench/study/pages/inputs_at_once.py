@@ -16,11 +16,9 @@ MOST_OUTPUTS = 4  # with a panel each
 def responses_to_inputs(
     records: Sequence[Record], fitted: FrequencyResponses | None = None
 ) -> tuple[list[dict[str, Any]], str]:
-    """The block of the frequency responses to several inputs; else none, and a sentence that says why.
+    """The block of the frequency responses of records to several inputs; else none, and a sentence that says why.
 
-    Args:
-        records: of the same inputs and outputs, one or more of them.
-        fitted: frequency responses of the identified modes, drawn over the measured ones.
+    Those of the identified modes, `fitted`, are drawn over the measured ones.
     """
     names = loudest(records[0], MOST_OUTPUTS)
     try:

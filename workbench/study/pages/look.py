@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.fft import rfft
@@ -35,7 +36,7 @@ MOST_FAULTS = 24  # messages per kind of fault; further faults are counted
 
 
 @dataclass(frozen=True)
-class Look:
+class FileReport:
     """The report of a measured file.
 
     Attributes:
@@ -43,7 +44,6 @@ class Look:
         rows: one per channel, under `HEADINGS`.
         remarks: faults of the data and other remarks.
         command: the suggested next command.
-        page_content: the content of the page.
     """
 
     heading: str
@@ -53,14 +53,27 @@ class Look:
     page_content: PageContent
 
 
-def look_at(measured: Record | FrequencyResponses, path: Path) -> Look:
+# heading, rows, remarks, options of `workbench identify`, and blocks of the page
+Parts = tuple[str, list[tuple[str, ...]], Sequence[str], list[str], list[dict[str, Any]]]
+
+
+def file_report(measured: Record | FrequencyResponses, path: Path) -> FileReport:
     """The report of a record or of FRFs read from `path`."""
-    if isinstance(measured, FrequencyResponses):
-        return _frfs(measured, path)
-    return _record(measured, path)
+    parts = _frfs(measured) if isinstance(measured, FrequencyResponses) else _record(measured)
+    heading, rows, remarks, options, blocks = parts
+    command = shlex.join(["workbench", "identify", str(path), *options])
+    page_content = PageContent(
+        title=f"What {path.name} holds",
+        lead=heading,
+        lines=[*remarks, f"Go on with: {command}"],
+        blocks=blocks,
+        tables=[("Channels", HEADINGS, rows)],
+        made_by=f"workbench look {path}",
+    )
+    return FileReport(heading, tuple(rows), tuple(remarks), command, page_content)
 
 
-def _record(record: Record, path: Path) -> Look:
+def _record(record: Record) -> Parts:
     faults = [fault for fault in data_faults(record) if not fault.inputs]
     faulty = {name for fault in faults for name in fault.outputs[-1:] if fault.kind in ("dead", "copied")}
     by_unit = [c.name for c in record.output_channels if c.quantity == "force"]
@@ -75,13 +88,12 @@ def _record(record: Record, path: Path) -> Look:
     if forces and kept:
         record = record.with_inputs(forces)
     channels = (*record.input_channels, *record.output_channels)
-    signals = (*record.inputs, *record.outputs)
-    shown = [*zip(channels, signals, strict=True)][:MOST_ROWS]
-    rows = tuple(_row(channel, row, record.sample_rate_hz) for channel, row in shown)
-    seconds = record.n_samples * record.sample_time
+    shown = [*zip(channels, (*record.inputs, *record.outputs), strict=True)][:MOST_ROWS]
+    rows = [_row(channel, row, record.sample_rate_hz) for channel, row in shown]
     heading = (
         f"{counted(record.n_outputs, 'output')} and {counted(record.n_inputs, 'input')}, {record.n_samples} samples at"
-        f" {record.sample_rate_hz:.6g} Hz, {seconds:.6g} s from {record.start_time:.6g} s on"
+        f" {record.sample_rate_hz:.6g} Hz, {record.n_samples * record.sample_time:.6g} s from"
+        f" {record.start_time:.6g} s on"
     )
     quiet = _quiet(record.select_outputs(kept)) if kept else []
     remarks = [*record.remarks, *_messages([*faults, *quiet, *input_faults(record)])]
@@ -92,28 +104,20 @@ def _record(record: Record, path: Path) -> Look:
     unstated = [channel.name for channel, _ in shown if not channel.quantity]
     if unstated:
         remarks.append(f"the file states no quantity for {', '.join(unstated)}: their units are as recorded")
-    options, notes = _options(record, forces, kept, faulty)
-    remarks += notes
-    command = shlex.join(["workbench", "identify", str(path), *options])
+    options, more = _options(record, forces, kept, faulty)
+    remarks += more
     moving = record
     if kept or forces:
         moving = record.select_outputs([name for name in record.output_names if name not in faulty])
     driven = moving.n_inputs == 1 and bool(np.ptp(moving.inputs)) and moving.n_samples >= 16 * SEGMENTS
     at_once, why_not = responses_to_inputs([moving]) if moving.n_inputs > 1 and moving.n_outputs else ([], "")
-    page_content = PageContent(
-        title=f"What {path.name} holds",
-        lead=heading,
-        lines=[*remarks, f"Go on with: {command}"],
-        blocks=[
-            block(plot(record), "The signals as recorded."),
-            block(plot_spectra(moving), f"Power spectral density, by Welch's method. {why_not}".rstrip()),
-            *([block(plot_frf(moving), "Frequency response functions and coherence.")] if driven else []),
-            *at_once,
-        ],
-        tables=[("Channels", HEADINGS, rows)],
-        made_by=f"workbench look {path}",
-    )
-    return Look(heading, rows, tuple(remarks), command, page_content)
+    blocks = [
+        block(plot(record), "The signals as recorded."),
+        block(plot_spectra(moving), f"Power spectral density, by Welch's method. {why_not}".rstrip()),
+        *([block(plot_frf(moving), "Frequency response functions and coherence.")] if driven else []),
+        *at_once,
+    ]
+    return heading, rows, remarks, options, blocks
 
 
 def _options(
@@ -142,10 +146,9 @@ def _messages(faults: Sequence[DataFault]) -> list[str]:
     """The messages of faults; of each kind at most `MOST_FAULTS`, then the number of the others."""
     messages = []
     for kind in dict.fromkeys(fault.kind for fault in faults):
-        each = [fault for fault in faults if fault.kind == kind]
-        messages += [fault.message for fault in each[:MOST_FAULTS]]
-        if len(each) > MOST_FAULTS:
-            messages.append(f"{len(each) - MOST_FAULTS} more channels are {kind}")
+        each = [fault.message for fault in faults if fault.kind == kind]
+        more = f"{len(each) - MOST_FAULTS} more channels are {kind}"
+        messages += [*each[:MOST_FAULTS], more] if len(each) > MOST_FAULTS else each
     return messages
 
 
@@ -167,12 +170,11 @@ def _quiet(record: Record) -> list[DataFault]:
     return faults
 
 
-def _frfs(measured: FrequencyResponses, path: Path) -> Look:
+def _frfs(measured: FrequencyResponses) -> Parts:
     lines = measured.frequencies_hz
     rows = []
     for channel, row in zip(measured.output_channels, np.abs(measured.values), strict=True):
-        largest = row.max(axis=0)
-        at = ", ".join(f"{f:.5g}" for f in _strongest(lines, largest**2))
+        at = ", ".join(f"{f:.5g}" for f in _strongest(lines, row.max(axis=0) ** 2))
         rms = float(np.sqrt((row**2).mean()))
         rows.append((channel.name, "magnitude", *(f"{v:.4g}" for v in (row.min(), row.max(), row.mean(), rms)), at))
     n, m = len(measured.output_channels), len(measured.references)
@@ -180,26 +182,14 @@ def _frfs(measured: FrequencyResponses, path: Path) -> Look:
         f"FRFs of {counted(n, 'output')} and {counted(m, 'input')}, {lines.size} lines from"
         f" {lines[0]:.6g} to {lines[-1]:.6g} Hz"
     )
-    command = shlex.join(["workbench", "identify", str(path)])
-    page_content = PageContent(
-        title=f"What {path.name} holds",
-        lead=heading,
-        lines=[*measured.remarks, f"Go on with: {command}"],
-        blocks=[block(plot_frf_matrix(measured), "Magnitude and phase of the FRFs.")],
-        tables=[("Channels", HEADINGS, rows)],
-        made_by=f"workbench look {path}",
-    )
-    return Look(heading, tuple(rows), measured.remarks, command, page_content)
+    return heading, rows, measured.remarks, [], [block(plot_frf_matrix(measured), "Magnitude and phase of the FRFs.")]
 
 
 def _row(channel: Channel, row: np.ndarray, rate_hz: float) -> tuple[str, ...]:
-    quantity = channel.quantity or "not stated"
-    quantity += f" [{channel.unit}]" if channel.unit else ""
+    quantity = (channel.quantity or "not stated") + (f" [{channel.unit}]" if channel.unit else "")
     numbers = (f"{value:.4g}" for value in (row.min(), row.max(), row.mean(), row.std()))
-    if row.size < 16 * SEGMENTS:
-        return channel.name, quantity, *numbers, ""
-    lines, power = power_spectrum(row, rate_hz)
-    return channel.name, quantity, *numbers, ", ".join(f"{f:.4g}" for f in _strongest(lines, power))
+    peaks = _strongest(*power_spectrum(row, rate_hz)) if row.size >= 16 * SEGMENTS else ()
+    return channel.name, quantity, *numbers, ", ".join(f"{f:.4g}" for f in peaks)
 
 
 def _strongest(lines: np.ndarray, power: np.ndarray) -> Sequence[float]:

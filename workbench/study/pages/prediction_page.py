@@ -21,14 +21,7 @@ def prediction_page(
     measured: Record | None = None,
     made_by: str,
 ) -> Path:
-    """Write the page.
-
-    Args:
-        path: of the HTML file.
-        name, folder: of the case.
-        check, measured: the check of the prediction and the record of the test, if the test was made.
-        made_by: the command that makes the page again.
-    """
+    """Write the page of a case, with the check of the prediction and the measured record if the test was made."""
     draws = prediction.expected.shape[0]
     caption = f"{100 * LEVEL:g} % prediction bands of the readings of each sensor, from {draws} draws."
     if len(prediction.channels) > MOST_SENSORS:

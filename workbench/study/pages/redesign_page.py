@@ -10,7 +10,7 @@ from workbench.design.loop.closed_loop import Response
 from workbench.design.loop.rig_loop import LoopTest, run_loop
 from workbench.draw.motion import response_motion
 from workbench.draw.robust import NEW, OLD, plot_redesign, plot_steps
-from workbench.draw.style import COLOURS, new_figure
+from workbench.draw.style import GREY, new_figure
 from workbench.records.record import Record
 from workbench.rig.actuators import Actuator
 from workbench.robust.redesign import Redesign
@@ -27,15 +27,7 @@ NEGLIGIBLE = 1e-4  # loss, relative to vibration and effort, up to which the fig
 
 
 def redesign_page(found: Redesign, path: Path, *, name: str, record: Record, folder: Path, made_by: str) -> Path:
-    """Write the page.
-
-    Args:
-        path: of the HTML file.
-        name: of the case.
-        record: a measured record, whose inputs are applied as forces to both loops.
-        folder: of the case.
-        made_by: the command that makes the page again.
-    """
+    """Write the page of a case; the inputs of a measured record are applied as forces to both loops."""
     blocks = _replayed(found, record)
     test = found.test
     excitation = "the test"
@@ -49,8 +41,8 @@ def redesign_page(found: Redesign, path: Path, *, name: str, record: Record, fol
     )
     blocks.append(block(plot_redesign(found), compared))
     if max(s.loss for s in found.steps) > NEGLIGIBLE:
-        stepwise = f"From the present controller to the redesigned one, step by step: the {LOSS}."
-        blocks.append(block(plot_steps(found), stepwise))
+        caption = f"From the present controller to the redesigned one, step by step: the {LOSS}."
+        blocks.append(block(plot_steps(found), caption))
     steps = [(s.name, s.what, s.lost, s.in_new_controller) for s in found.steps]
     tables: list[Table] = [
         ("On the same samples: median (95 % interval)", ("", "present", "redesigned"), _figures(found)),
@@ -58,14 +50,11 @@ def redesign_page(found: Redesign, path: Path, *, name: str, record: Record, fol
     ]
     used = found.verification if found.improves else found.present_verification
     moved = [] if found.relocation is None else [found.relocation.sentence]
+    safe = "good" if found.safe and not found.spillover_warning else "part"
     page_content = PageContent(
         title=f"Redesign for {name}",
         lead=f"{found.advice} {found.guarantee}".rstrip(),
-        standing="bad"
-        if used.share_stable < 0.95
-        else "good"
-        if found.safe and not found.spillover_warning
-        else "part",
+        standing="bad" if used.share_stable < 0.95 else safe,
         lines=[found.comparison, *moved, *found.notes],
         blocks=blocks,
         tables=tables,
@@ -80,22 +69,19 @@ def _figures(found: Redesign) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = [("stable samples", *(f"{p.n_stable} of {p.n_draws}" for p in (old, new)))]
     for r in found.controlled:
         rows.append((f"damping ratio of mode {r + 1} [%]", *(_rounded(100.0 * p.damping[:, r]) for p in (old, new))))
-    each = (
-        ("worst_damping", "least damping ratio of any mode [%]", 100.0),
-        ("controlled_settling", "settling time of the controlled modes [s]", 1.0),
-        ("settling", "of all modes [s]", 1.0),
-        ("peak_force", "peak force [N]", 1.0),
-        ("stroke", "largest displacement at an actuator [m]", 1.0),
-        ("controlled_work", "work in controlled modes, W_C [J]", 1.0),
-        ("residual_work", "in residual modes, W_R [J]", 1.0),
-        ("effort", "effort, ∫ FᵀF dt [N² s]", 1.0),
-    )
-    for name, words, scale in each:
+    rows.append(("least damping ratio of any mode [%]", *(_rounded(100.0 * p.worst_damping) for p in (old, new))))
+    each = {
+        "controlled_settling": "settling time of the controlled modes [s]",
+        "settling": "of all modes [s]",
+        "peak_force": "peak force [N]",
+        "stroke": "largest displacement at an actuator [m]",
+        "controlled_work": "work in controlled modes, W_C [J]",
+        "residual_work": "in residual modes, W_R [J]",
+        "effort": "effort, ∫ FᵀF dt [N² s]",
+    }
+    for name, words in each.items():
         # for a growing motion the value depends on the length of the test
-        known = [name == "worst_damping" or p.share_stable >= 0.5 for p in (old, new)]
-        cells = [
-            _rounded(scale * getattr(p, name)) if k else "diverges" for p, k in zip((old, new), known, strict=True)
-        ]
+        cells = (_rounded(getattr(p, name)) if p.share_stable >= 0.5 else "diverges" for p in (old, new))
         rows.append((found.units.named(words), *cells))
     rows.append(("output uncertainty tolerated (small gain) [%]", *(_margin(p) for p in (old, new))))
     return rows
@@ -125,10 +111,8 @@ def _replayed(found: Redesign, record: Record) -> list[dict[str, Any]]:
         return []
     name = f" “{record.name}”" if record.name else ""
     caption = f"Under the inputs of the measured record{name}"
-    shown = []
-    domain = rig.modes.domain
-    placed = not (isinstance(domain, NamedPoints) and domain.positions is None)
-    if placed and old.bounded and new.bounded:
+    shown, domain = [], rig.modes.domain
+    if old.bounded and new.bounded and not (isinstance(domain, NamedPoints) and domain.positions is None):
         shown.append(_moving(found, old.response, new.response, caption))
     read = any(s.quantity == "displacement" for s in rig.sensors)
     where = "the sensor with the largest reading, and that measured without control" if read else "an actuator"
@@ -158,15 +142,13 @@ def _readings(found: Redesign, record: Record, responses: dict[str, Response]) -
     if seen:
         i, sensor = max(seen, key=lambda one: float(np.abs(record.outputs[one[0], :n]).max()))
         shape, name = rig.modes.phi_at(sensor.at, direction=sensor.direction), sensor.name
-        ax.plot(
-            record.time[:n], record.outputs[i, :n], color="#8a8a8a", linewidth=0.8, label="measured, without control"
-        )
+        look = {"color": GREY, "linewidth": 0.8, "label": "measured, without control"}
+        ax.plot(record.time[:n], record.outputs[i, :n], **look)
     else:
         shape, name = displacement_at(rig.modes, rig.actuators[0]), f"at {rig.actuators[0].name}"
-    for (label, response), colour in zip(responses.items(), (COLOURS[1], COLOURS[0]), strict=True):
-        ax.plot(
-            response.time, shape @ response.modal[: response.modes.n_modes], color=colour, linewidth=1.0, label=label
-        )
+    for (label, response), colour in zip(responses.items(), (OLD, NEW), strict=True):
+        reading = shape @ response.modal[: response.modes.n_modes]
+        ax.plot(response.time, reading, color=colour, linewidth=1.0, label=label)
     limit = 1.3 * max(float(np.abs(line.get_ydata()).max()) for line in ax.lines if line.get_label() != "present")
     time, length = found.units.time, found.units.length
     ax.set(xlabel=f"time [{time}]", ylabel=f"displacement, {name} [{length}]", ylim=(-limit, limit))

@@ -21,24 +21,16 @@ from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes
+from workbench.structure.printed import counted
 from workbench.study.pages.page import PageContent, Table, block, short, to_its_error, write_page
 
-MOVING = (
-    "The modes of the nominal model, and of the corrected one where it differs; circles are sensors, triangles inputs."
-)
-
+MOVING = "Modes of the nominal model, and of the corrected one where it differs; circles are sensors, triangles inputs."
 GAPS = {"before": "before [%]", "after": "after [%]", "floor": "noise floor [%]"}
 STANDING_OF = {"none": "good", "explained": "good", "part": "part", "unknown": "bad"}  # by outcome
 
 
 def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | None, made_by: str) -> Path:
-    """Write the page: verdict, responses, localisation, unmodelled force, alternatives.
-
-    Args:
-        path: of the HTML file.
-        folder: of the case, whose files are then listed on the page; None for a case from records alone.
-        made_by: the command that makes the page again.
-    """
+    """Write the page; the files of a case folder are listed on it, those of a case from records alone are not."""
     nominal, corrected = verdict.nominal.modes, verdict.corrected.modes
     changed = nominal.n_modes != corrected.n_modes or not np.allclose(nominal.omega, corrected.omega, rtol=1e-6)
     records = (*case.fit, *case.validation)
@@ -46,18 +38,11 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
     rigs, fitted = {"nominal": verdict.nominal}, "corrected" if verdict.outcome == "explained" else "best fit"
     if verdict.outcome != "none" and better:  # a model that makes the gap larger is not a correction
         rigs[fitted] = verdict.corrected
-    blocks = [
-        block(
-            plot_budget(verdict.budget),
-            "What causes the gap: the power of the nominal residual, split by cause, on"
-            + (" the validation records." if case.validation else " the records that were fitted."),
-        ),
-        block(
-            plot_responses(rigs, records, time_unit=verdict.units.time),
-            f"Measured and simulated response ({', '.join(rigs)}) where they differ most. Nothing was fitted"
-            " to the validation records.",
-        ),
-    ]
+    split = "What causes the gap: the power of the nominal residual, split by cause, on the"
+    split += " validation records." if case.validation else " records that were fitted."
+    beside = f"Measured and simulated response ({', '.join(rigs)}) where they differ most. Nothing was fitted to the"
+    responses = plot_responses(rigs, records, time_unit=verdict.units.time)
+    blocks = [block(plot_budget(verdict.budget), split), block(responses, f"{beside} validation records.")]
     if verdict.shows_gap:  # without a gap the residual is noise, and has no place
         where = (
             "Where the gap is: its power above the noise, by sensor, mode and record; and the likelihood of a single"
@@ -69,18 +54,13 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
             made = "The unmodelled force reconstructed from the records, over the motion at its place."
             blocks.append(block(plot_unmodelled_force(verdict), made))
         if verdict.attribution.singles:  # single effects are not fitted if model errors were fitted from the start
-            each = (
-                f"Residual of the best fit of each effect {verdict.attribution.fitted_with}, without model errors; an"
-                " effect at the noise floor explains all."
-            )
-            blocks.append(block(plot_single_effects(verdict), each))
+            each = f"Residual of the best fit of each effect {verdict.attribution.fitted_with}, without model errors;"
+            blocks.append(block(plot_single_effects(verdict), f"{each} an effect at the noise floor explains all."))
     distortions = _of_lowest_and_highest(records)
     if distortions:
-        seen = (
-            "Spectra of the records: excited lines, odd and even lines that are not excited, and noise."
-            + " Only odd lines are excited, so even ones reveal an even nonlinearity."
-            * all(d.parity_resolved for d in distortions)
-        )
+        seen = "Spectra of the records: excited lines, odd and even lines that are not excited, and noise."
+        if all(d.parity_resolved for d in distortions):
+            seen += " Only odd lines are excited, so even ones reveal an even nonlinearity."
         blocks.append(block(plot_distortion(distortions), seen))
     if verdict.shows_gap:
         modes = {"nominal": nominal, **({fitted: corrected} if changed and fitted in rigs else {})}
@@ -103,17 +83,11 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
     best_fit = content.get("best_fit", content.get("nearest", []))  # the name in files of earlier versions
     beyond = {kind.name for kind in BEYOND}.issuperset(effect["kind"] for effect in best_fit)
     title = "Effects" if beyond else "Best-fitting effects: they do not explain the gap"
-    effects = [
-        [
-            label_in_words(effect["kind"]),
-            name.replace("_", " "),
-            *_in_its_unit(effect, name),
-            _place(effect),
-            effect.get("input", effect.get("output", "")),
-        ]
-        for effect in [*content["effects"], *best_fit]
-        for name in effect["parameters"]
-    ]
+    effects = []
+    for effect in [*content["effects"], *best_fit]:
+        words, channel = label_in_words(effect["kind"]), effect.get("input", effect.get("output", ""))
+        for name in effect["parameters"]:
+            effects.append([words, name.replace("_", " "), *_in_its_unit(effect, name), _place(effect), channel])
     gap, closed = content["gap"], content.get("shrinkage", {})
     length = content.get("units", {}).get("length", "m")
     gaps = [
@@ -125,17 +99,12 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
     if any(rests):
         heads.append("cause of the residual")
         gaps = [[*row, rest] for row, rest in zip(gaps, rests, strict=True)]
-    alternatives = [
-        [each.get("words") or in_words(each["kind"]), each["probability"]] for each in content["alternatives"]
-    ]
+    alternatives = [[one.get("words") or in_words(one["kind"]), one["probability"]] for one in content["alternatives"]]
     if alternatives and content.get("probability") is not None:
         alternatives.insert(0, ["selected set", content["probability"]])
+    of_effects = ("effect", "parameter", "value", "standard deviation", f"position [{length}]", "input or output")
     tables = [
-        (
-            title,
-            ("effect", "parameter", "value", "standard deviation", f"position [{length}]", "input or output"),
-            effects,
-        ),
+        (title, of_effects, effects),
         ("Gap: rms error / rms signal", heads, gaps),
         ("Alternatives that the records do not exclude", ("set of effects", "probability"), alternatives),
     ]
@@ -203,16 +172,15 @@ def case_inputs(folder: Path) -> dict[str, str]:
 
 def _could_show(verdict: Verdict) -> str:
     """A sentence on the effects that the records can and cannot show."""
-    hidden, alike = verdict.detectability.undetectable, verdict.detectability.indistinguishable
-    count = len(verdict.detectability.strengths)
-    text = "Detectability, before any fit: these records can show"
-    text += f" {f'all but {len(hidden)} of' if hidden else 'all'} {count} effects"
+    found = verdict.detectability
+    hidden, alike, count = found.undetectable, found.indistinguishable, len(found.strengths)
+    some = f"all but {len(hidden)} of" if hidden else "all"
+    text = f"Detectability, before any fit: these records can show {some} {count} effects"
     if hidden:
         named = ", ".join(map(label_in_words, hidden[:6]))
         text += f" (not {named}{', …' if len(hidden) > 6 else ''})"
     if alike:
         one, other = map(label_in_words, alike[0][:2])
         text += f"; at small strength they cannot distinguish {one} from {other}"
-        more = len(alike) - 1
-        text += f", nor {more} more {'pair' if more == 1 else 'pairs'}" if more else ""
+        text += f", nor {counted(len(alike) - 1, 'more pair')}" if len(alike) > 1 else ""
     return text + "."

@@ -27,12 +27,10 @@ def encoded(value: object, where: str = "the result") -> Any:
     Raises:
         TypeError: a value is neither number, text, list, dict nor array.
     """
-    if value is None or isinstance(value, bool | int | str):
-        return value
     if isinstance(value, np.generic):
         return encoded(value.item(), where)
-    if isinstance(value, float):
-        return float(value)
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
     if isinstance(value, complex):
         return {COMPLEX: [value.real, value.imag]}
     if isinstance(value, np.ndarray) and value.dtype.kind in KINDS:
@@ -70,9 +68,8 @@ def read_record(path: Path) -> dict[str, Any] | None:
     """The record of a file; None if the file does not exist or is damaged."""
     try:
         outer = json.loads(path.read_text(encoding="utf-8"))
-        whole = outer["sha256"] == _sum(outer["record"])
-        record: dict[str, Any] | None = json.loads(outer["record"]) if whole else None
-        return record
+        record: dict[str, Any] = json.loads(outer["record"])
+        return record if outer["sha256"] == _sum(outer["record"]) else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 

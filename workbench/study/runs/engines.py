@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import cloudpickle
 from joblib import Parallel, delayed, parallel_config
@@ -25,18 +25,12 @@ if TYPE_CHECKING:
 
 DIED = "its process died: out of memory, killed, or crashed in compiled code"
 CONNECT_SECONDS = 10.0
-MOST_BARREN = 2
+MOST_DEATHS = 2  # of all processes, one after another without a result
 
 
 @dataclass(frozen=True)
 class Job:
-    """One case to be computed.
-
-    Attributes:
-        key: of the result.
-        arguments: of the function.
-        file: to which the computing process writes the result; None if this process does.
-    """
+    """One case to be computed; the computing process writes the result to `file`, if one is given."""
 
     key: str
     arguments: Mapping[str, Any]
@@ -63,7 +57,7 @@ def work(function: Callable[..., Any], job: Job, running: Path | None = None) ->
         record["trace"] = traceback.format_exc()
     record["seconds"] = time.perf_counter() - start
     if job.file is not None:
-        record["unkept"] = keep(job.file, record)
+        record["unwritten"] = keep(job.file, record)
     if running is not None:
         (running / job.key).unlink(missing_ok=True)
     return record
@@ -101,8 +95,7 @@ def packed(function: Callable[..., Any]) -> bytes:
     for module in own:
         cloudpickle.register_pickle_by_value(module)
     try:
-        content: bytes = cloudpickle.dumps(function)
-        return content
+        return bytes(cloudpickle.dumps(function))
     finally:
         for module in own:
             cloudpickle.unregister_pickle_by_value(module)
@@ -111,8 +104,7 @@ def packed(function: Callable[..., Any]) -> bytes:
 @functools.lru_cache(maxsize=4)
 def unpacked(function: bytes) -> Callable[..., Any]:
     """The function of `packed`, unpickled once per process."""
-    found: Callable[..., Any] = cloudpickle.loads(function)
-    return found
+    return cast(Callable[..., Any], cloudpickle.loads(function))
 
 
 def here(
@@ -146,7 +138,7 @@ def processes(
     """
     waiting, sent = {job.key: job for job in jobs}, packed(function)
     elsewhere: set[str] = set()
-    barren = 0
+    deaths = 0
     with tempfile.TemporaryDirectory(prefix="workbench-") as folder:
         running = Path(folder)
         while waiting:
@@ -162,27 +154,22 @@ def processes(
                         del waiting[key]
                         yield key, record
             except TerminatedWorkerError:
-                for key, record in _already_kept(waiting.values()):
-                    del waiting[key]
-                    yield key, record
-                suspects = [waiting[path.name] for path in running.iterdir() if path.name in waiting]
+                written = {key: read_record(job.file) for key, job in waiting.items() if job.file is not None}
+                for key, record in written.items():  # before the process could return it
+                    if record is not None:
+                        del waiting[key]
+                        yield key, record
+                suspects = [waiting.pop(path.name) for path in running.iterdir() if path.name in waiting]
                 for path in list(running.iterdir()):
                     path.unlink()
                 for job in suspects:
-                    del waiting[job.key]
                     yield job.key, _alone(sent, job, running)
-                barren = barren + 1 if (len(waiting), len(elsewhere)) == before else 0
-                if barren == MOST_BARREN:
+                deaths = deaths + 1 if (len(waiting), len(elsewhere)) == before else 0
+                if deaths == MOST_DEATHS:
                     raise StudyError(
-                        f"the processes of this run died {barren} times before they began a case: the function's data"
+                        f"the processes of this run died {deaths} times before they began a case: the function's data"
                         " cannot be sent to them; run it with workers=1"
                     ) from None
-
-
-def _already_kept(jobs: Iterable[Job]) -> list[tuple[str, dict[str, Any]]]:
-    """Records that a process had written before it could return them."""
-    records = [(job.key, read_record(job.file)) for job in jobs if job.file is not None]
-    return [(key, record) for key, record in records if record is not None]
 
 
 def _parallel(

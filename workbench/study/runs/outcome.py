@@ -28,11 +28,9 @@ class Outcome:
     """The results of a study; a study adds to them while it runs.
 
     Attributes:
-        name: of the study.
         title: the question of the study.
-        figures_folder: folder of the figures.
-        on_say, on_track, on_report: called with each line, each iterable to show progress for, and the
-            progress of a run.
+        on_say, on_track, on_report: called with each line, each iterable to show progress for, and the progress of a
+            run.
         cache: folder of the results of cases.
         scheduler: address of a Dask scheduler that computes the cases of every run; None for local processes.
     """
@@ -78,9 +76,8 @@ class Outcome:
     def check(self, name: str, value: float, limit: float, at_least: bool = False) -> None:
         """Add a check: `value` must be at most `limit`, or at least `limit` with `at_least`."""
         holds = bool(value >= limit if at_least else value <= limit)
-        self.checks.append(
-            {"name": name, "value": plain(value), "limit": plain(limit), "holds": holds, "at_least": at_least}
-        )
+        found = {"name": name, "value": plain(value), "limit": plain(limit), "holds": holds, "at_least": at_least}
+        self.checks.append(found)
 
     def figure(self, name: str, figure: Figure, caption: str) -> None:
         """Save a figure as figures/STUDY-name.png, and show it on the page."""

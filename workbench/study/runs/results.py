@@ -25,11 +25,9 @@ class Result:
     """The result of one case.
 
     Attributes:
-        parameters: of the case.
         seed: of the case; None if the function takes no seed.
         values: by name; empty if the case failed.
-        error: the exception of the case in one line; None if it succeeded.
-        trace: the traceback of the error.
+        error, trace: the exception of the case in one line, and its traceback; None if it succeeded.
         seconds: time of the computation.
     """
 

@@ -53,9 +53,9 @@ def run(
     if workers is not None and workers < 1:
         raise StudyError(f"workers must be at least 1; got {workers}")
     seeds = _seeds(checked_cases, function, seed)
-    print_ = fingerprint(function) if cache is not None else ""
-    keys = [key_of(case, print_, s) for case, s in zip(checked_cases, seeds)]
-    folder = None if cache is None else Path(cache).resolve() / f"{_name(function)}-{print_[:12]}"
+    digest = fingerprint(function) if cache is not None else ""
+    keys = [key_of(case, digest, s) for case, s in zip(checked_cases, seeds)]
+    folder = None if cache is None else Path(cache).resolve() / f"{_name(function)}-{digest[:12]}"
     files = dict.fromkeys(keys) if folder is None else {key: folder / f"{key}.json" for key in keys}
     found = {key: read_record(file) for key, file in files.items() if file is not None}
     records = {key: record for key, record in found.items() if record is not None}
@@ -73,21 +73,24 @@ def run(
         progress(f"waiting for {n} cases of another run")
 
     progress(f"{len(records)} of {len(files)} cases")
-    unkept: list[str] = []
+    unwritten: list[str] = []
     for key, record in _computed(function, list(jobs.values()), workers, scheduler, awaiting):
         records[key] = record
         file = files[key]
         if scheduler and file is not None:
-            record["unkept"] = keep(file, record)
-        unkept += filter(None, [record.get("unkept")])
+            record["unwritten"] = keep(file, record)
+        unwritten += filter(None, [record.get("unwritten")])
         progress(f"{len(records)} of {len(files)} cases")
-    if unkept:
+    if unwritten:
         warnings.warn(
-            f"{len(unkept)} of {len(files)} results could not be written to {folder} and would be computed again:"
-            f" {unkept[0]}",
+            f"{len(unwritten)} of {len(files)} results could not be written to {folder} and would be computed again:"
+            f" {unwritten[0]}",
             stacklevel=2,
         )
-    return Results(_result(case, s, records[key]) for case, s, key in zip(checked_cases, seeds, keys))
+    return Results(
+        Result(case, case.get("seed", s), decoded(r["result"] or {}), r["error"], r["trace"], r["seconds"])
+        for case, s, r in zip(checked_cases, seeds, (records[key] for key in keys))
+    )
 
 
 def _computed(
@@ -102,9 +105,7 @@ def _computed(
     if scheduler:
         return cluster(function, jobs, scheduler)
     workers = min(workers or cores(), len(jobs))
-    if workers == 1:
-        return here(function, jobs, awaiting)
-    return processes(function, jobs, workers, awaiting)
+    return here(function, jobs, awaiting) if workers == 1 else processes(function, jobs, workers, awaiting)
 
 
 def _seeds(cases: Sequence[Mapping[str, Any]], function: Callable[..., Any], root: int) -> list[int | None]:
@@ -113,11 +114,6 @@ def _seeds(cases: Sequence[Mapping[str, Any]], function: Callable[..., Any], roo
     except (TypeError, ValueError):
         wants = False
     return [seed_of(case, root) if wants and "seed" not in case else None for case in cases]
-
-
-def _result(case: dict[str, Any], seed: int | None, record: dict[str, Any]) -> Result:
-    shown = case.get("seed") if seed is None else seed
-    return Result(case, shown, decoded(record["result"] or {}), record["error"], record["trace"], record["seconds"])
 
 
 def _name(function: Callable[..., Any]) -> str:
