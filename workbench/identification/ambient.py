@@ -8,7 +8,7 @@ lag τ > 0 is a free decay of the structure (NExT: James, Carne & Lauffer, SAND9
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -24,7 +24,7 @@ from workbench.identification.signal.modal_estimates import (
 )
 from workbench.identification.signal.projection import project
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Progress, TimeLimit, check_count
-from workbench.records.record import Channel, Record
+from workbench.records.record import Record
 from workbench.renamed import Renamed, former_arguments
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread
@@ -93,7 +93,19 @@ def correlation_functions(
         ValueError: an output that never moves; an unknown reference; a record shorter than forty times `max_lag`.
     """
     check_outputs_move([record])
-    return _decays(record, max_lag, references)
+    lags, rows = _lags(record, max_lag, references)
+    correlations = _correlations(record, lags, rows) / record.n_samples
+    std = record.outputs.std(axis=1)  # for equal weights of the references
+    return tuple(
+        Record(
+            record.sample_time,
+            values / std[j],
+            tuple(replace(channel, noise_std=None) for channel in record.output_channels),
+            start_time=record.sample_time,
+            name=f"{record.name} with {record.output_names[j]}",
+        )
+        for j, values in zip(rows, correlations, strict=True)
+    )
 
 
 @former_arguments(longest="max_lag")
@@ -125,9 +137,8 @@ def identify_ambient(
         ValueError: as `correlation_functions`; no mode found, or fewer than asked for.
     """
     check_count("n_modes", n_modes)
-    check_outputs_move([record])
     time_limit = TimeLimit(seconds, progress)
-    decays = _decays(record, max_lag, references)
+    decays = correlation_functions(record, max_lag=max_lag, references=references)
     subspace = Subspace(_combinations(record), record.sample_time)
     stable = subspace.stable()
     # A mode has a pole, a shape and an excitation, less a scale factor, at one of n_samples frequencies.
@@ -198,7 +209,8 @@ def _lags(record: Record, max_lag: float | None, references: Sequence[str] | Non
         rows = sorted(int(j) for j in strongest)
     else:
         rows = [record.output_names.index(name) for name in record.select_outputs(references).output_names]
-    most, least = record.n_samples // AMBIENT.least_length, AMBIENT.least_lags // 4
+    width = AMBIENT.least_lags
+    most, least = record.n_samples // AMBIENT.least_length, width // 4
     if most < least:
         raise ValueError(
             f"record {record.name!r} has {record.n_samples} samples; modes of random vibration take at least"
@@ -214,15 +226,9 @@ def _lags(record: Record, max_lag: float | None, references: Sequence[str] | Non
     if max_lag is None:
         correlations = _correlations(record, 4 * lags, rows)
         energy = (correlations / correlations.std(axis=2, keepdims=True)) ** 2
-        windows = (
-            energy.sum(axis=(0, 1))[: 4 * lags // AMBIENT.least_lags * AMBIENT.least_lags]
-            .reshape(-1, AMBIENT.least_lags)
-            .mean(axis=1)
-        )
+        windows = energy.sum(axis=(0, 1))[: 4 * lags // width * width].reshape(-1, width).mean(axis=1)
         errors = np.median(windows[windows.size // 2 :])
-        lags = min(
-            lags, AMBIENT.least_lags * max(1, int(np.argmax(np.r_[windows, 0.0] < AMBIENT.above_errors * errors)))
-        )
+        lags = min(lags, width * max(1, int(np.argmax(np.r_[windows, 0.0] < AMBIENT.above_errors * errors))))
     return lags, rows
 
 
@@ -232,20 +238,3 @@ def _correlations(record: Record, lags: int, rows: list[int]) -> np.ndarray:
     size = 2 ** int(np.ceil(np.log2(record.n_samples + lags)))
     outputs, references = np.fft.rfft(centred, size), np.fft.rfft(centred[rows], size)
     return np.ascontiguousarray(np.fft.irfft(references.conj()[:, None] * outputs, size)[..., 1 : lags + 1])
-
-
-def _decays(record: Record, max_lag: float | None, references: Sequence[str] | None) -> tuple[Record, ...]:
-    """Correlation functions as records, one per reference, over its standard deviation for equal weights."""
-    lags, rows = _lags(record, max_lag, references)
-    correlations = _correlations(record, lags, rows) / record.n_samples
-    std = record.outputs.std(axis=1)
-    return tuple(
-        Record(
-            record.sample_time,
-            values / std[j],
-            tuple(Channel(c.name, c.quantity, c.unit, c.at) for c in record.output_channels),
-            start_time=record.sample_time,
-            name=f"{record.name} with {record.output_names[j]}",
-        )
-        for j, values in zip(rows, correlations, strict=True)
-    )

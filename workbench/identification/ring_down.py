@@ -15,12 +15,7 @@ from workbench.identification.free_decay.assumptions import (
 )
 from workbench.identification.free_decay.ibrahim import stabilise, stable_modes, stacked_delays
 from workbench.identification.free_decay.order import identify_within
-from workbench.identification.free_decay.preparation import (
-    Drift,
-    without_drift,
-    without_polynomial,
-    without_spikes,
-)
+from workbench.identification.free_decay.preparation import Drift, without_drift, without_polynomial, without_spikes
 from workbench.identification.free_decay.refinement import in_coloured_noise, refine, unshaped
 from workbench.identification.signal.clocks import clock_remarks, shape_remarks
 from workbench.identification.signal.data_quality import (
@@ -215,7 +210,11 @@ def _identify_with_drift(
     taken = _dominant_drifts(records)  # one per record once drift is removed
     span = max(record.n_samples * record.sample_time for record in records)
     for _ in range(RING_DOWN.drift_rounds):
-        identified = _identify([drift.record for drift in taken] or records, n_modes, time_limit)
+        decays = [drift.record for drift in taken] or records
+        if n_modes is None:
+            identified = identify_within(decays, time_limit)
+        else:
+            identified = _refine_given(stacked_delays(decays, n_modes=n_modes), decays, time_limit)
         before, poles = poles, identified.modes.poles
         poles = poles[np.abs(poles) * span > 2.0 * np.pi]
         drifts = [without_drift(record, poles) for record in records]
@@ -264,12 +263,6 @@ def _settles_within_a_period(drift: Drift) -> bool:
     return drift.time_constant is not None and bool(drift.time_constant * omega < 2.0 * np.pi)
 
 
-def _identify(records: list[Record], n_modes: int | None, time_limit: TimeLimit) -> IdentifiedModes:
-    if n_modes is None:
-        return identify_within(records, time_limit)
-    return _refine_given(stacked_delays(records, n_modes=n_modes), records, time_limit)
-
-
 def _by_stabilisation(records: list[Record], time_limit: TimeLimit) -> IdentifiedModes:
     highest = max(2, min(RING_DOWN.max_modes, min(record.n_samples for record in records) // 8))
     start = stable_modes(stabilise(records, orders=range(2, highest + 1))).modes
@@ -286,13 +279,10 @@ def _refine_given(start: SampledModes, records: list[Record], time_limit: TimeLi
 
 
 def _check_undriven(record: Record) -> None:
-    """Refuse a record of random vibration: it does not decay, and is uncorrelated at long lags.
+    """Refuse a record of random vibration, by a ValueError: it does not decay, and is uncorrelated at long lags.
 
     A free decay of very low damping stays correlated at any lag. Of records of random vibration that are twenty decay
     times long three in four are detected, of a hundred decay times nine in ten.
-
-    Raises:
-        ValueError: such a record.
     """
     n = record.n_samples
     if n // 3 == n // 2:  # too few for any mode, which the identification refuses
@@ -335,11 +325,7 @@ WAY_OUT = (
 
 
 def _check_decays(records: list[Record], refined: RefinedModes) -> None:
-    """Refuse records whose strongest mode has negative damping.
-
-    Raises:
-        ValueError: naming the mode.
-    """
+    """Refuse, by a ValueError, records whose strongest mode has negative damping."""
     strongest = int(np.argmax(_energy(refined, records)))
     zeta = refined.modes.zeta[strongest]
     if zeta < -SURE * refined.zeta_std[strongest]:
@@ -397,11 +383,6 @@ def _inconsistent_shapes(refined: RefinedModes, records: list[Record], only: Seq
     """A remark on modes whose shapes differ between records beyond noise: their amplitudes have rank two.
 
     Two modes of the same pole are fitted as one pole, with a different mixture of their shapes in each record.
-
-    Args:
-        refined: the modes.
-        records: the free decays.
-        only: the modes to test, from 0.
     """
     inconsistent = []
     energies = [_envelope_energy(record, refined) for record in records]
