@@ -158,8 +158,8 @@ class Subspace:
                 if not (0 < -pole.real < SUBSPACE.most_damped * abs(pole) and low < abs(pole) < top):
                     continue
                 gain *= self.n_samples / decimation
-                own = (order,), (complex(pole),)
-                mode = StablePole(complex(pole), shape, 0.0, gain, *own, decimation, np.full((2, 2), np.nan))
+                found = complex(pole)
+                mode = StablePole(found, shape, 0.0, gain, (order,), (found,), decimation, np.full((2, 2), np.nan))
                 others = [group for group in groups if group[-1].orders[0] != order]
                 distances = [_distance(mode, group[-1]) for group in others]
                 if min(distances, default=np.inf) < SUBSPACE.near:
@@ -184,9 +184,9 @@ def _median_mode(group: Sequence[StablePole], orders: range) -> StablePole:
     """The mode nearest the median of a group, with the orders and poles for its errors."""
     poles = np.array([mode.pole for mode in group])
     nearest = int(np.argmin(np.abs(poles - np.median(poles.real) - 1j * np.median(poles.imag))))
-    taken, share = group[:: 1 + len(group) // SUBSPACE.most_taken], len(group) / len(orders)
-    each = tuple(mode.orders[0] for mode in taken), tuple(mode.pole for mode in taken)
-    return replace(group[nearest], presence=share, orders=each[0], poles=each[1])
+    taken = group[:: 1 + len(group) // SUBSPACE.most_taken]
+    orders_taken, poles_taken = zip(*((mode.orders[0], mode.pole) for mode in taken))
+    return replace(group[nearest], presence=len(group) / len(orders), orders=orders_taken, poles=poles_taken)
 
 
 class Model:
@@ -254,6 +254,7 @@ def _covariances(outputs: np.ndarray, n_lags: int) -> np.ndarray:
     The biased estimate is positive definite.
     """
     n = outputs.shape[1]
-    lines = np.fft.rfft(outputs, next_fast_len(n + n_lags, real=True))
-    covariances = np.fft.irfft(lines[:, None] * lines.conj(), next_fast_len(n + n_lags, real=True))
+    size = next_fast_len(n + n_lags, real=True)
+    lines = np.fft.rfft(outputs, size)
+    covariances = np.fft.irfft(lines[:, None] * lines.conj(), size)
     return np.ascontiguousarray(covariances[..., :n_lags].transpose(2, 0, 1) / n)
