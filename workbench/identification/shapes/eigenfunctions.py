@@ -58,7 +58,7 @@ class BoundaryConditions:
         Raises:
             ValueError: an end of unknown name.
         """
-        zeros, essential = [], []
+        zeros = []
         for at, end in ((0.0, left), (float(length), right)):
             if end is None:
                 continue
@@ -66,8 +66,7 @@ class BoundaryConditions:
                 known = ", ".join(f"{e} {k}" for k, e in ZERO_AT)
                 raise ValueError(f"no boundary condition of a {kind!r} is called {end!r}; there are {known}")
             zeros += [(at, derivative) for derivative in ZERO_AT[kind, end]]
-            essential += [(at, d) for d in ZERO_AT[kind, end] if d < ESSENTIAL_BELOW[kind]]
-        return cls(tuple(zeros), tuple(essential))
+        return cls(tuple(zeros), tuple((at, d) for at, d in zeros if d < ESSENTIAL_BELOW[kind]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,12 +120,12 @@ def interpolating_spline(
     at_sensors = np.asarray(positions, float)
     _check_places(at_sensors, length, degree)
     slack = 1e-9 * length
-    elsewhere = [at for at, _ in ends.zeros if min(abs(at), abs(at - length)) > slack]
-    if elsewhere:
-        raise ValueError(
-            f"a boundary condition holds at x = {elsewhere[0]:g}, which is no end of the structure, 0 to {length:g};"
-            " give both the same length"
-        )
+    for at, _ in ends.zeros:
+        if min(abs(at), abs(at - length)) > slack:
+            raise ValueError(
+                f"a boundary condition holds at x = {at:g}, which is no end of the structure, 0 to {length:g};"
+                " give both the same length"
+            )
     conditions = _usable(ends.zeros, degree, length)
     held_places = [at for at, derivative in conditions if derivative == 0]
     used = np.array([all(abs(x - at) > slack for at in held_places) for x in at_sensors], bool)
@@ -209,17 +208,11 @@ def eigenfunctions(
 def best_degrees(
     sampled: SampledModes, *, length: float, ends: BoundaryConditions = BoundaryConditions()
 ) -> np.ndarray:
-    """The spline degree among 3, 5, 7 and 9 that best predicts each inner sensor from the others, (n_modes,).
-
-    Args:
-        sampled: shapes of displacement at placed sensors.
-        length: m.
-        ends: boundary conditions.
-    """
+    """The spline degree among 3, 5, 7 and 9 that best predicts each inner sensor from the others, (n_modes,)."""
     check_along(sampled)
     values = normalised_shapes(sampled.shapes).real
     order = np.argsort(sampled.positions)
-    errors, degrees = [], []
+    errors = []
     for degree in DEFAULT_DEGREES:
         squares = np.zeros(sampled.n_modes)
         try:
@@ -230,10 +223,8 @@ def best_degrees(
         except ValueError:
             break  # too few sensors for this degree, and so for any higher one
         errors.append(squares)
-        degrees.append(degree)
-    if not degrees:
-        return np.full(sampled.n_modes, DEFAULT_DEGREES[0])
-    return np.asarray(np.array(degrees)[np.argmin(errors, axis=0)])
+    best = np.argmin(errors, axis=0) if errors else np.zeros(sampled.n_modes, int)
+    return np.asarray(np.array(DEFAULT_DEGREES)[best])
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,11 +259,8 @@ def mass_quadrature(
 ) -> tuple[np.ndarray, np.ndarray, tuple[tuple[np.ndarray, int], ...]]:
     """∫ m φ² dx + Σ (M_k φ² + J_k φ'²) of splines φ = W v as Σ weights (rule v)²: a sum of squares does not cancel.
 
-    The mass is that of `eigenfunctions`; by default one that gives ∫ φ_r² dx = length.
-
-    Returns:
-        weights (n_terms,); rule (n_terms, n_sensors), φ or φ' per value at each sensor; and the places of the terms,
-        (n_places,) m, with the order of the derivative, in turn.
+    The weights (n_terms,); the rule (n_terms, n_sensors), φ or φ' per value at each sensor; and the places of the
+    terms, (n_places,) m, with the order of the derivative, in turn.
     """
     if mass_per_length is None and len(point_masses):
         raise ValueError("point masses are used beside a mass distribution; give mass_per_length too")
@@ -295,11 +283,7 @@ def mass_quadrature(
 
 
 def check_along(sampled: SampledModes) -> None:
-    """Refuse sensors that are not all placed along an interval.
-
-    Raises:
-        ValueError: a sensor without a place, or with one of another kind.
-    """
+    """Refuse, by a ValueError, sensors that are not all placed along an interval."""
     check_placed(sampled)
     if not sampled.on_interval:
         raise ValueError(

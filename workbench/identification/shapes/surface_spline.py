@@ -20,12 +20,7 @@ from scipy.stats import chi2
 
 from workbench.arrays import symmetric_root
 from workbench.identification.shapes.bands import BANDS, Bands, deviation_and_width, propagated
-from workbench.identification.signal.modal_estimates import (
-    ShapeEstimates,
-    check_level,
-    check_placed,
-    normalised_shapes,
-)
+from workbench.identification.signal.modal_estimates import ShapeEstimates, check_level, check_placed, normalised_shapes
 from workbench.structure.domain import Rectangle
 from workbench.structure.modes import Modes, SampledModes, frozen
 from workbench.structure.profile import FieldLike, as_field
@@ -68,15 +63,13 @@ def _kernel(offset: np.ndarray, derivative: tuple[int, int]) -> np.ndarray:
 
 def _cubics(at: np.ndarray, derivative: tuple[int, int]) -> np.ndarray:
     """A derivative of every cubic monomial at places (n, 2): (n, 10)."""
-    columns = []
-    for powers in CUBIC:
-        column = np.ones(len(at))
+    columns = np.ones((len(at), len(CUBIC)))
+    for k, powers in enumerate(CUBIC):
         for axis, (power, order) in enumerate(zip(powers, derivative, strict=True)):
             below = power - order
             falling = np.prod(np.arange(power, below, -1)) if below >= 0 else 0.0
-            column = column * falling * at[:, axis] ** max(below, 0)
-        columns.append(column)
-    return np.column_stack(columns)
+            columns[:, k] = columns[:, k] * falling * at[:, axis] ** max(below, 0)
+    return columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,14 +167,10 @@ class SurfaceSpline:
         return matrix
 
     def error(self, at: np.ndarray, derivatives: Sequence[tuple[int, int]] = ((0, 0),)) -> np.ndarray:
-        """Covariance of the interpolation error for τ² = 1, (n_derivatives n_at, n_derivatives n_at).
-
-        Of one derivative after another, at places (n_at, 2).
-        """
+        """Covariance of the interpolation error for τ² = 1, of one derivative after another at places (n_at, 2)."""
         offset = (at[:, None] - at) / self.domain.size
-        prior_covariance = np.block(
-            [[(-1.0) ** (k + m) * _kernel(offset, (i + k, j + m)) for k, m in derivatives] for i, j in derivatives]
-        )
+        prior_covariance = np.block([[(-1.0) ** (k + m) * _kernel(offset, (i + k, j + m)) for k, m in derivatives]
+                                     for i, j in derivatives])  # fmt: skip
         rows = np.vstack([self._rows(at, d) for d in derivatives])
         scale = np.repeat([self.domain.size ** -sum(d) for d in derivatives], len(at))
         return np.asarray((prior_covariance - rows @ self._system @ rows.T) * np.outer(scale, scale))
@@ -189,10 +178,8 @@ class SurfaceSpline:
     def roughness(self, values: np.ndarray, covariance: np.ndarray) -> float:
         """Upper confidence limit of τ² of values (n_places,) of known covariance; 0 where they may be noise.
 
-        By the likelihood of the contrasts orthogonal to all cubics (restricted maximum likelihood).
-
-        Raises:
-            ValueError: no more values and edge points than the ten of a cubic.
+        By the likelihood of the contrasts orthogonal to all cubics (restricted maximum likelihood), of which there must
+        be one.
         """
         values, covariance = values[self._used], covariance[np.ix_(self._used, self._used)]
         n, size = values.size, len(self._equations)
