@@ -217,8 +217,8 @@ def _damaged(candidates: Candidates) -> FittedStructure:
     for _ in range(LOSS.most_looks):
         if damaged.explains or n_fewer >= max(damaged.n_terms):
             break
-        n_mass, n_stiffness = (n - n_fewer for n in damaged.n_terms)
-        fewer = max(n_mass, candidates.mass_terms[0]), max(n_stiffness, candidates.stiffness_terms[0])
+        least = candidates.mass_terms[0], candidates.stiffness_terms[0]
+        fewer = (max(n - n_fewer, fewest) for n, fewest in zip(damaged.n_terms, least, strict=True))
         other = _from_scan(candidates.problem(*fewer), damaged)
         if other.criterion < damaged.criterion - 1.0:
             damaged, n_fewer = _best_beside(candidates, other), 0
@@ -257,7 +257,7 @@ def _undamaged(candidates: Candidates, damaged: FittedStructure, threshold: floa
 def _with_mass(candidates: Candidates, damaged: FittedStructure) -> FittedStructure | None:
     """The best fit without a loss but with one more point mass; None where no fit converges."""
     best: FittedStructure | None = None
-    for n_terms in {_first_terms(candidates): None, damaged.n_terms: None}:
+    for n_terms in dict.fromkeys((_first_terms(candidates), damaged.n_terms)):
         problem = candidates.problem(*n_terms)
         starts = [(intact, part) for intact in _without_loss(problem) for part in _likely_masses(problem, intact)]
         if best is not None:
@@ -394,8 +394,5 @@ def _fit_near_mass(problem: Problem, near: FittedStructure, part: PointMass) -> 
     bounds = np.r_[np.full(n_free, -np.inf), least], np.r_[np.full(n_free, np.inf), most]
     z = CachedResidual(fit).least(start, PROBLEM.most_steps, bounds=bounds, ftol=1e-5)
     found = report(_with_point_mass(problem, *(z[-2:] * scale)), z[:-2])
-    return replace(
-        found,
-        degrees_of_freedom=found.degrees_of_freedom - 2,
-        criterion=found.criterion + 2.0 * problem.task.penalty,
-    )
+    penalised = found.criterion + 2.0 * problem.task.penalty
+    return replace(found, degrees_of_freedom=found.degrees_of_freedom - 2, criterion=penalised)

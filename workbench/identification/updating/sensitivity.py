@@ -59,46 +59,30 @@ class LocalLoss:
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """Elastic modes and their derivatives.
+    """Elastic modes and their derivatives."""
 
-    Attributes:
-        omega: (n_modes,) rad/s.
-        shapes: (n_sensors, n_modes), mass-normalised.
-        omega_by: (n_modes, n_parameters) derivatives of ω.
-        shapes_by: (n_sensors, n_modes, n_parameters) derivatives of the shapes.
-    """
-
-    omega: np.ndarray
-    shapes: np.ndarray
-    omega_by: np.ndarray
-    shapes_by: np.ndarray
+    omega: np.ndarray  # (n_modes,) rad/s
+    shapes: np.ndarray  # (n_sensors, n_modes), mass-normalised
+    omega_by: np.ndarray  # (n_modes, n_parameters)
+    shapes_by: np.ndarray  # (n_sensors, n_modes, n_parameters)
 
 
 @dataclass(frozen=True, eq=False)
 class SeriesStructure:
-    """A nominal structure with series for the relative changes of its mass and stiffness.
+    """A nominal structure with series for the relative changes of its mass and stiffness."""
 
-    Attributes:
-        nominal: ends, attachments, m_0 and k_0.
-        mass, stiffness: M_j and K_j.
-        positions: (n_sensors,) of the sensors, m.
-        n_modes: number of the lowest modes that are resolved.
-    """
-
-    nominal: Bar | Beam
-    mass: Basis
-    stiffness: Basis
-    positions: np.ndarray
-    n_modes: int
+    nominal: Bar | Beam  # ends, attachments, m_0 and k_0
+    mass: Basis  # M_j
+    stiffness: Basis  # K_j
+    positions: np.ndarray  # (n_sensors,) of the sensors, m
+    n_modes: int  # number of the lowest modes that are resolved
 
     @property
     def bases(self) -> tuple[Basis, Basis]:
-        """M_j and K_j."""
         return self.mass, self.stiffness
 
     @property
     def nominal_profiles(self) -> tuple[Profile, Profile]:
-        """m_0 and k_0."""
         return self.nominal.mass_per_length, self.nominal.stiffness
 
     def solve(self, d: np.ndarray, e: np.ndarray, loss: LocalLoss | None = None) -> "SolvedSeries | None":
