@@ -107,10 +107,7 @@ def _confine(limits: ReadLimits) -> None:
         return
     # includes the start of this process and leaves a second for the parent; a short limit applies to the file alone
     used = max(math.floor(limits.seconds) - 1, math.ceil(time.process_time()) + 1)
-    for limit, value in (
-        (resource.RLIMIT_AS, int(limits.memory) + OVERHEAD),
-        (resource.RLIMIT_CORE, 0),
-        (resource.RLIMIT_CPU, used),
-    ):
+    memory = int(limits.memory) + OVERHEAD
+    for limit, value in ((resource.RLIMIT_AS, memory), (resource.RLIMIT_CORE, 0), (resource.RLIMIT_CPU, used)):
         hard = resource.getrlimit(limit)[1]
         resource.setrlimit(limit, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))

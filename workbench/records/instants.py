@@ -30,18 +30,12 @@ ORDER, LONGEST_PART, MOST_SIGNALS = 32, 2**15, 8
 
 @dataclass(frozen=True, eq=False)
 class Sampling:
-    """The sampling of a record.
+    """The sampling of a record, at equal steps."""
 
-    Attributes:
-        start, step: of equal steps, s.
-        times: (n_samples,) unequal instants, from which the signals are to be resampled; else None.
-        remarks: on assumptions and changes.
-    """
-
-    start: float
-    step: float
-    times: np.ndarray | None = None
-    remarks: tuple[str, ...] = ()
+    start: float  # s
+    step: float  # s
+    times: np.ndarray | None = None  # (n_samples,) unequal instants, from which the signals are to be resampled
+    remarks: tuple[str, ...] = ()  # on assumptions and changes
 
 
 def in_seconds(name: str, values: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -60,11 +54,7 @@ def in_seconds(name: str, values: np.ndarray) -> tuple[np.ndarray, tuple[str, ..
 
 
 def even_sampling(
-    path: Path,
-    time: np.ndarray,
-    signals: Sequence[np.ndarray],
-    stated_hz: float | None,
-    row_of: Callable[[int], int],
+    path: Path, time: np.ndarray, signals: Sequence[np.ndarray], stated_hz: float | None, row_of: Callable[[int], int]
 ) -> Sampling:
     """Start and step of sample instants, which may be rounded, or jitter, or be uneven.
 
@@ -159,10 +149,8 @@ def _rounded(path: Path, time: np.ndarray, steps: np.ndarray, stated_hz: float |
     rate = _roundest(low, high) if stated is None else stated
     remark = f"{allowed}: taken as evenly sampled at {rate:.7g} Hz"
     if width > TELLING and stated is None:
-        remark += (
-            f"; frequencies and rates of decay are uncertain by as much, {100 * width:.2g} %: state the rate by"
-            " `sample_rate_hz` if you know it"
-        )
+        remark += f"; frequencies and rates of decay are uncertain by as much, {100 * width:.2g} %:"
+        remark += " state the rate by `sample_rate_hz` if you know it"
     residual = time - np.arange(time.size) / rate
     return Sampling(float(residual.max() + residual.min()) / 2, 1.0 / rate, remarks=(remark,))
 

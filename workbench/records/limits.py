@@ -81,11 +81,7 @@ class Deadline:
         self._begun = time.process_time()
 
     def check(self, share: float = 1.0) -> None:
-        """Refuse, by a `RecordFileError`, to continue where the time limit is or, by extrapolation, will be exceeded.
-
-        Args:
-            share: of the file, read so far.
-        """
+        """Refuse, by a `RecordFileError`, to go on beyond the limit, or where the share of the file read foretells that."""
         spent = time.process_time() - self._begun
         extrapolates = spent > TELLING * self._seconds
         if spent > self._seconds or (extrapolates and spent / share > self._seconds * _allowed(share)):
@@ -117,12 +113,7 @@ def check_file(path: Path) -> None:
 def check_counts(path: Path, n_channels: int, n_numbers: int, limits: ReadLimits = DEFAULT, share: float = 1.0) -> None:
     """Refuse, by a `RecordFileError`, more channels than `MOST_CHANNELS` or more numbers than the memory allows.
 
-    Args:
-        path: of the file.
-        n_channels: in the whole file.
-        n_numbers: in a share of the file.
-        limits: see `ReadLimits`.
-        share: of the file; the rest is extrapolated.
+    The numbers are those of a share of the file, from which the rest is extrapolated.
     """
     if n_channels > MOST_CHANNELS:
         raise RecordFileError(f"{path} holds {n_channels} channels; at most {MOST_CHANNELS} are read")

@@ -113,10 +113,8 @@ class Record(Printed):
                 f"record {self.name!r}: inputs and outputs must have as many samples, time last; got"
                 f" {inputs.shape[1]} and {outputs.shape[1]}"
             )
-        for kind, values, channels in (
-            ("input", inputs, self.input_channels),
-            ("output", outputs, self.output_channels),
-        ):
+        sides = ("input", inputs, self.input_channels), ("output", outputs, self.output_channels)
+        for kind, values, channels in sides:
             if values.shape[0] != len(channels):
                 raise ValueError(
                     f"record {self.name!r}: {kind}s must have shape ({len(channels)} channels, n_samples);"
@@ -202,15 +200,12 @@ class Record(Printed):
         inside = np.flatnonzero((time >= low) & (time <= high))
         if inside.size == 0:
             wanted = [f"{word} {at:g} s" for word, at in (("from", start), ("to", stop)) if at is not None]
-            raise ValueError(
-                f"record {self.name!r} runs from {time[0]:g} to {time[-1]:g} s: it has no sample {' '.join(wanted)}"
-            )
+            span = f"from {time[0]:g} to {time[-1]:g} s"
+            raise ValueError(f"record {self.name!r} runs {span}: it has no sample {' '.join(wanted)}")
         if inside.size == self.n_samples:
             return self
-        kept = slice(inside[0], inside[-1] + 1)
-        return replace(
-            self, outputs=self.outputs[:, kept], inputs=self.inputs[:, kept], start_time=float(time[inside[0]])
-        )
+        kept, first = slice(inside[0], inside[-1] + 1), float(time[inside[0]])
+        return replace(self, outputs=self.outputs[:, kept], inputs=self.inputs[:, kept], start_time=first)
 
     only = Renamed("select_outputs")
 
