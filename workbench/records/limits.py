@@ -81,7 +81,7 @@ class Deadline:
         self._begun = time.process_time()
 
     def check(self, share: float = 1.0) -> None:
-        """Refuse, by a `RecordFileError`, to go on beyond the limit, or where the share of the file read foretells that."""
+        """Refuse, by a `RecordFileError`, to go on beyond the limit, or where the share read so far foretells that."""
         spent = time.process_time() - self._begun
         extrapolates = spent > TELLING * self._seconds
         if spent > self._seconds or (extrapolates and spent / share > self._seconds * _allowed(share)):
