@@ -59,16 +59,8 @@ from workbench.rig.statespace import signal_names
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread
 
-
-@dataclass(frozen=True)
-class DrivenSettings:
-    """Constants of the stages of an identification from known inputs."""
-
-    driven_share: float = 0.3  # share of the motion of a mode due to the inputs, below which they do not drive it
-    final_seconds: float = 5.0  # of processor time for the last check of modes, even after the search used up its time
-
-
-DRIVEN = DrivenSettings()
+DRIVEN_SHARE = 0.3  # share of the motion of a mode due to the inputs, below which they do not drive it
+FINAL_SECONDS = 5.0  # of processor time for the last check of modes, even after the search used up its time
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -269,7 +261,7 @@ def identify_driven(
     if data.clock:
         logged, records = ([on_inputs_clock(record, data.clock) for record in each] for each in (logged, records))
     data, selected, changing = _as_time_invariant(data, selected, time_limit)
-    selected = only_predictive(data, selected, TimeLimit(DRIVEN.final_seconds))
+    selected = only_predictive(data, selected, TimeLimit(FINAL_SECONDS))
     selected, remarks = _without_artefacts(data, selected, time_limit)
     if delays is None:
         remarks = (*delay_remarks(data), *remarks)
@@ -304,7 +296,7 @@ def _is_steady_and_undriven(data: KnownInputs, fit: Fit, r: int) -> bool:
     l_r[data.n_inputs :] = 0.0
     by_inputs = np.linalg.norm(modal_coordinate(responses, l_r))
     decays = -pole.real * 2.0 * np.pi / data.resolution
-    return bool(decays < 1.0 and by_inputs < DRIVEN.driven_share * norm)
+    return bool(decays < 1.0 and by_inputs < DRIVEN_SHARE * norm)
 
 
 def _response_sizes(data: KnownInputs, fit: Fit) -> Floats:

@@ -134,11 +134,6 @@ def coherence_noise(frf: ArrayLike, coherence: ArrayLike, *, averages: int) -> n
     return np.asarray(np.abs(h) * np.sqrt((1.0 - squared) / (2.0 * squared * averages)))
 
 
-TURNED = (
-    "the impulse responses come before the impulse, as in FRFs for e^(-iωt): their complex conjugates were identified"
-)
-
-
 @former_arguments(most_modes="max_modes", transfer="frf")
 @one_blas_thread
 def identify_frf(
@@ -201,7 +196,14 @@ def identify_frf(
         estimate.modes.poles, np.sqrt(estimate.statistic), 2.0 * np.pi * estimate.scatter_hz, deviation
     )
     checks = (
-        *([TURNED] if turned else []),
+        *(
+            [
+                "the impulse responses come before the impulse, as in FRFs for e^(-iωt): their complex conjugates were"
+                " identified"
+            ]
+            if turned
+            else []
+        ),
         *_delay_remarks(estimate.delays, channels),
         *repeated_remarks(estimate),
         *set_up_remarks(estimate),

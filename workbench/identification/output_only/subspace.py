@@ -56,26 +56,16 @@ SUBSPACE = SubspaceSettings()
 
 @dataclass(frozen=True, eq=False)
 class StablePole:
-    """A mode that is stable over the model orders.
+    """A mode that is stable over the model orders."""
 
-    Attributes:
-        pole: λ, rad/s.
-        shape: (n_outputs,) complex, in the quantities of the outputs.
-        presence: share of the orders at which it was found.
-        statistic: twice the log-likelihood ratio, by one-step prediction, of the record with and without the mode.
-        orders, poles: model orders at which it was found, and its pole at each.
-        decimation: ratio of the record's sampling rate to the one at which it was found.
-        variance: (2, 2) of Re λ and Im λ; nan until estimated.
-    """
-
-    pole: complex
-    shape: np.ndarray
-    presence: float
-    statistic: float
-    orders: tuple[int, ...]
-    poles: tuple[complex, ...]
-    decimation: int
-    variance: np.ndarray
+    pole: complex  # λ, rad/s
+    shape: np.ndarray  # (n_outputs,) complex, in the quantities of the outputs
+    presence: float  # share of the orders at which it was found
+    statistic: float  # twice the log-likelihood ratio, by one-step prediction, with and without the mode
+    orders: tuple[int, ...]  # at which it was found
+    poles: tuple[complex, ...]  # at each of these
+    decimation: int  # ratio of the record's sampling rate to the one at which it was found
+    variance: np.ndarray  # (2, 2) of Re λ and Im λ; nan until estimated
 
 
 class Subspace:
@@ -112,8 +102,8 @@ class Subspace:
             if time_limit is not None and b >= SUBSPACE.least_blocks and time_limit.spent("standard errors"):
                 break
             jackknife.append(self._poles_without(b, modes))
-        n, freedom = len(jackknife), len(jackknife) - 1
-        scale = (student.ppf(0.975, freedom) / student.ppf(0.975, np.inf)) ** 2 * (SUBSPACE.blocks - 1) / n
+        n = len(jackknife)
+        scale = (student.ppf(0.975, n - 1) / student.ppf(0.975, np.inf)) ** 2 * (SUBSPACE.blocks - 1) / n
         estimates = []
         for r, mode in enumerate(modes):
             replicates = np.array([one[r] for one in jackknife])
@@ -215,11 +205,9 @@ class Model:
         return int(np.clip(2 * np.sum(self._correlations > noise), SUBSPACE.least_order, SUBSPACE.most_order))
 
     def poles(self, order: int, statistic: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The poles of a model in the upper half plane.
+        """The poles of a model in the upper half plane, as ln μ (n_poles,) of the discrete poles μ.
 
-        Returns:
-            ln μ (n_poles,) of the discrete poles μ, shapes (n_outputs, n_poles), and with `statistic` the test
-            statistic of each pole per sample, (n_poles,), else zeros.
+        With their shapes (n_outputs, n_poles) and the test statistic of each per sample (n_poles,), if asked for.
         """
         c = self._c[:, :order]
         mu, vectors = np.linalg.eig(self._a[:order, :order])

@@ -6,7 +6,7 @@ them; the others are removed by leaving out the knots nearest to that end ("not 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, cast
 from warnings import warn
 
@@ -71,21 +71,13 @@ class BoundaryConditions:
 
 @dataclass(frozen=True, eq=False)
 class Spline:
-    """The linear map from values at the sensors to a spline along the structure.
+    """The linear map from values at the sensors to a spline along the structure."""
 
-    Attributes:
-        knots: (n_functions + degree + 1,) of the B-splines, m.
-        degree: odd.
-        weights: (n_functions, n_sensors): coefficients = weights @ values.
-        conditions: boundary conditions used, (x, derivative) each.
-        held_weights: (n_functions, n_conditions): change of the coefficients per unit value of each condition.
-    """
-
-    knots: np.ndarray
-    degree: int
-    weights: np.ndarray = field(repr=False)
-    conditions: tuple[tuple[float, int], ...] = ()
-    held_weights: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
+    knots: np.ndarray  # (n_functions + degree + 1,) of the B-splines, m
+    degree: int  # odd
+    weights: np.ndarray  # (n_functions, n_sensors): coefficients = weights @ values
+    conditions: tuple[tuple[float, int], ...]  # boundary conditions used, (x, derivative) each
+    held_weights: np.ndarray  # (n_functions, n_conditions): change of the coefficients per unit value of each condition
 
     def matrix(self, x: np.ndarray, derivative: int = 0) -> np.ndarray:
         """Values (or derivatives) at x per value at each sensor, (n_points, n_sensors)."""
@@ -127,9 +119,9 @@ def interpolating_spline(
                 " give both the same length"
             )
     conditions = _usable(ends.zeros, degree, length)
-    held_places = [at for at, derivative in conditions if derivative == 0]
-    used = np.array([all(abs(x - at) > slack for at in held_places) for x in at_sensors], bool)
-    sites = np.union1d(at_sensors[used], np.array(held_places))
+    held_places = np.array([at for at, derivative in conditions if derivative == 0])
+    used = (np.abs(at_sensors[:, None] - held_places) > slack).all(axis=1)
+    sites = np.union1d(at_sensors[used], held_places)
     derivatives = [(at, d) for at, d in conditions if d > 0]
     n_functions = sites.size + len(derivatives)
     if n_functions < degree + 1:
@@ -138,8 +130,7 @@ def interpolating_spline(
             f" add sensors or take degree {max(1, n_functions - 1 - n_functions % 2)}"
         )
     knots = _knots(sites, derivatives, length, degree)
-    unit = np.eye(n_functions)
-    basis = BSpline(knots, unit, degree)
+    basis = BSpline(knots, np.eye(n_functions), degree)
     rows = [basis(at_sensors[used])] + [basis(at, d)[None] * length**d for at, d in conditions]
     inverse = np.linalg.inv(np.vstack(rows))
     weights = np.zeros((n_functions, at_sensors.size))
