@@ -461,13 +461,12 @@ def _scatter_remark(estimate: FrfModes) -> tuple[str, ...]:
     narrow = [str(r + 1) for r in np.flatnonzero((estimate.scatter_hz > 0) & (lines < FRF.resolved))]
     leaks = (
         f". Fewer than {FRF.resolved:g} lines lie in the half-power bandwidth of mode{'s' * (len(narrow) > 1)}"
-        f" {', '.join(narrow)}: if"
-        " these are averages by Hann's window, its leakage makes that damping too high"
+        f" {', '.join(narrow)}: if these are averages by Hann's window, its leakage makes that damping too high"
     )
     return (
         f"frequencies scatter in the peaks of {', '.join(which)}: such a mode changes with time or amplitude, or a"
         " window blurs it, and its frequency and damping are means; measure at one level, and longer segments"
-        + (leaks if narrow else ""),
+        f"{leaks if narrow else ''}",
     )
 
 
@@ -551,12 +550,13 @@ def _checked(
         )
     if not np.isfinite(f).all() or (np.diff(f) <= 0).any():
         raise ValueError("FRFs need finite frequencies that increase; sort them, each once")
-    noise = None if noise_std is None else np.asarray(noise_std, float)
-    if noise is not None and noise.shape not in ((), np.shape(frf)):
-        raise ValueError(f"noise_std must have the shape of frf, {np.shape(frf)}; got {noise.shape}")
-    noise = None if noise is None else np.broadcast_to(noise, np.shape(frf)).reshape(h.shape)
-    if noise is not None and not ((noise > 0) & np.isfinite(noise)).all():
-        raise ValueError("noise_std must be positive and finite at every line; give lines without noise a floor")
+    noise: np.ndarray | None = None
+    if noise_std is not None:
+        if np.shape(noise_std) not in ((), np.shape(frf)):
+            raise ValueError(f"noise_std must have the shape of frf, {np.shape(frf)}; got {np.shape(noise_std)}")
+        noise = np.broadcast_to(np.asarray(noise_std, float), np.shape(frf)).reshape(h.shape)
+        if not ((noise > 0) & np.isfinite(noise)).all():
+            raise ValueError("noise_std must be positive and finite at every line; give lines without noise a floor")
     low, high = (0.0, np.inf) if band_hz is None else band_hz
     keep = (f >= low) & (f <= high) & (f > 0)
     if keep.sum() < 12:

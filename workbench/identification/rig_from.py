@@ -148,9 +148,8 @@ def _shapes_of_residues(
     residues = _residues(modes, modes.shapes, identified.participation)
     sizes = np.linalg.svd(residues.real, compute_uv=False)
     complexity = np.sqrt(np.maximum(1.0 - sizes[:, 0] ** 2 / np.sum(np.abs(residues) ** 2, axis=(1, 2)), 0.0))
-    participation_error = np.linalg.norm(identified.participation_std, axis=1) / np.linalg.norm(
-        identified.participation, axis=1
-    )
+    norms = (np.linalg.norm(x, axis=1) for x in (identified.participation_std, identified.participation))
+    participation_error = np.divide(*norms)
     _warn_of_complex(modes, complexity, np.hypot(shape_errors(identified), participation_error), "residues")
     for remark in set_up_remarks(identified):
         warnings.warn(remark, stacklevel=3)
@@ -295,10 +294,9 @@ def _propagated(identified: DrivenModes | FrfModes, values: Callable[[np.ndarray
     slopes = []
     for step in np.moveaxis(steps, 2, 0):
         shape, participation_step = step[:, :m].T * largest, step[:, m : m + q] + 1j * step[:, m + q :]
-        both = [
-            values(_residues(modes, modes.shapes + sign * shape, identified.participation + sign * participation_step))
-            for sign in (1.0, -1.0)
-        ]
+        changed = ((modes.shapes + sign * shape, identified.participation + sign * participation_step)
+                   for sign in (1.0, -1.0))  # fmt: skip
+        both = [values(_residues(modes, *each)) for each in changed]
         # the sign of a singular vector is arbitrary
         above, below = (f * np.where(np.sum(f * nominal, axis=1, keepdims=True) < 0, -1.0, 1.0) for f in both)
         slopes.append((above - below) / (2.0 * STEP))
@@ -343,12 +341,10 @@ def _driving_point(
 ) -> tuple[int, int] | None:
     """Indices of an output and the input at its place; None where there is no driving point."""
     if driving_point is not None:
-        input_names = [channel.name for channel in into]
-        output_names = [channel.name for channel in out]
+        input_names, output_names = ([channel.name for channel in side] for side in (into, out))
         if driving_point[0] not in input_names or driving_point[1] not in output_names:
-            raise ValueError(
-                f"driving_point is (input, output), of {', '.join(input_names)} and {', '.join(output_names)}"
-            )
+            names = f"{', '.join(input_names)} and {', '.join(output_names)}"
+            raise ValueError(f"driving_point is (input, output), of {names}")
         return output_names.index(driving_point[1]), input_names.index(driving_point[0])
     pairs = ((j, i) for j, measured in enumerate(out) for i, acting in enumerate(into)
              if measured.name == acting.name or (measured.at is not None and measured.at == acting.at))  # fmt: skip

@@ -48,10 +48,8 @@ class RingDownSettings:
     uncorrelated: float = 3.0  # correlation times √n_samples above which a signal oscillates; white noise has 1
     residual_share: float = 0.1  # largest share of the energy in the bands of the modes that is residual
     most_residual: float = 0.25  # likewise over all frequencies, where the residual is coloured
-    # undamped estimates within so much of the frequency of a mode, relative, and their number, from which on ambient
-    # forces are suspected
-    cluster_band: float = 0.05
-    cluster_size: int = 2
+    cluster_band: float = 0.05  # relative distance from the frequency of a mode to undamped estimates beside it
+    cluster_size: int = 2  # number of these from which on ambient forces are suspected
     second_shape: float = 0.1  # rms share of a mode's motion in all records outside one common shape, to be remarked
     peak_ratio: float = 5.0  # largest ratio of the residual in the bands of the modes to that beside them
     band: int = 6  # least half width of the band of a mode, bins
@@ -124,14 +122,13 @@ def ring_down(
     time_limit = TimeLimit(seconds, progress)
     records = of_same_sensors(records)
     decays, notes = [], []
+    not_compared = "Frequencies by amplitude are not compared there; leave it out, or cut the record"
     for record in records:
         decay, own_notes = _cut_to_decay(record, start)
         decays.append(decay)
         notes += own_notes if len(records) == 1 else [f"{record.name}: {note}" for note in own_notes]
         check_data_quality(decay)
-        notes += dropout_remark(
-            decay, "Frequencies by amplitude are not compared there; leave it out, or cut the record"
-        )
+        notes += dropout_remark(decay, not_compared)
         _check_undriven(decay)
     try:
         identified, decays, drift_notes = _identify_with_drift(decays, n_modes, time_limit)
@@ -299,11 +296,8 @@ def _check_undriven(record: Record) -> None:
     short, long = (float(np.sqrt((part**2).mean())) for part in lags)
     # White noise has no mode; the selection refuses it.
     oscillates = short > RING_DOWN.uncorrelated / np.sqrt(n)
-    if (
-        oscillates
-        and RING_DOWN.undecayed < energy[1] / max(energy[0], 1e-300) < 1.0 / RING_DOWN.undecayed
-        and long < RING_DOWN.correlated * short
-    ):
+    lasts = RING_DOWN.undecayed < energy[1] / max(energy[0], 1e-300) < 1.0 / RING_DOWN.undecayed
+    if oscillates and lasts and long < RING_DOWN.correlated * short:
         raise ValueError(
             f"record {record.name!r} is no free decay: it is as strong at its end as at its beginning, and not"
             f" correlated over its length. {WAY_OUT}"
@@ -368,10 +362,9 @@ def _large_residual(
 
 def _energy(refined: RefinedModes, records: list[Record]) -> np.ndarray:
     """Energy of each mode over all records, (n_modes,), outputs in units of their noise."""
-    energy = np.zeros(refined.modes.n_modes)
-    for record, amplitudes, noise in zip(records, refined.amplitudes, refined.noise, strict=True):
-        energy += (np.abs(amplitudes / noise[:, None]) ** 2).sum(axis=0) * _envelope_energy(record, refined)
-    return energy
+    each = zip(records, refined.amplitudes, refined.noise, strict=True)
+    squares = ((np.abs(a / noise[:, None]) ** 2).sum(axis=0) * _envelope_energy(r, refined) for r, a, noise in each)
+    return np.asarray(sum(squares))
 
 
 def _envelope_energy(record: Record, refined: RefinedModes) -> np.ndarray:

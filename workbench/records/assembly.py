@@ -215,8 +215,7 @@ def _units(path: Path, keys: Iterable[str], into: Units) -> dict[str, Unit]:
     """The units at the end of signal names; none for names that would be equal without them."""
     keys = list(keys)
     for key in keys:
-        both = contradiction(_name(key))
-        if both is not None:
+        if (both := contradiction(_name(key))) is not None:
             raise RecordFileError(
                 f"{path}, channel {_name(key)!r} states two units, {both[0]} and {both[1]}: leave the one that its"
                 " numbers are in"

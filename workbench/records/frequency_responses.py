@@ -60,8 +60,7 @@ class FrequencyResponses(Printed):
         ]
         f = self.frequencies_hz
         pairs = f"{counted(len(self.output_channels), 'output')} by {counted(len(self.references), 'reference')}"
-        span = f"{f.min(initial=np.inf):.4g} to {f.max(initial=0.0):.4g} Hz"
-        line = f"{self.name}: {pairs}, {f.size} lines, {span}"
+        line = f"{self.name}: {pairs}, {f.size} lines, {f.min(initial=np.inf):.4g} to {f.max(initial=0.0):.4g} Hz"
         return line, ("output", "quantity", "unit", "at", "peak"), rows, self.remarks
 
     @property
@@ -133,18 +132,11 @@ def impulse_record(
     """
     frf = np.atleast_2d(np.asarray(frf, complex))
     if frf.shape[0] != len(channels) or frf.shape[1] < 3:
-        raise ValueError(
-            f"FRFs must have shape ({len(channels)} outputs, n_frequencies); got {frf.shape}."
-            " Is frequency the last axis?"
-        )
+        wanted = f"({len(channels)} outputs, n_frequencies)"
+        raise ValueError(f"FRFs must have shape {wanted}; got {frf.shape}. Is frequency the last axis?")
     for channel, row in zip(channels, frf, strict=True):
         bad = ~np.isfinite(row)
         if bad.any():
             raise ValueError(f"{name}, channel {channel.name!r}: line {int(np.argmax(bad))} is not a number")
-    n_samples = 2 * (frf.shape[1] - 1)
-    return Record(
-        sample_time=1.0 / sample_rate_hz,
-        outputs=np.fft.irfft(frf, n=n_samples, axis=1) * sample_rate_hz,
-        output_channels=channels,
-        name=name,
-    )
+    outputs = np.fft.irfft(frf, n=2 * (frf.shape[1] - 1), axis=1) * sample_rate_hz
+    return Record(sample_time=1.0 / sample_rate_hz, outputs=outputs, output_channels=channels, name=name)

@@ -144,7 +144,7 @@ class Distributions(Printed):
             f"mass in {mass}, stiffness in {stiffness} from {counted(self.scales.size, 'mode')}, orthogonal to"
             f" {self.orthogonality:.2g}"
         )
-        rows = list(zip(*columns(self.mass, self.length), *columns(self.stiffness, self.length)[1:]))
+        rows = printed_rows(self.length, self.mass, self.stiffness)
         return line, ("x [m]", "mass [kg/m]", "±", "stiffness", "±"), rows, self.remarks
 
     @property
@@ -173,11 +173,11 @@ class Distributions(Printed):
         return tuple(remarks)
 
 
-def columns(of: Any, length: float) -> tuple[Sequence[str], Sequence[str], Sequence[str]]:
-    """Columns of a printed distribution with a `std`: places, values and their standard errors."""
+def printed_rows(length: float, *distributions: Any) -> list[tuple[str, ...]]:
+    """Rows of printed distributions with a `std`: a place, then value and standard error of each."""
     x = np.linspace(0.0, length, PRINTED)
-    values, errors = zip(*(rounded(value, error) for value, error in zip(of(x), of.std(x), strict=True)))
-    return [f"{at:.4g}" for at in x], values, errors
+    numbers = zip(x, *(zip(each(x), each.std(x), strict=True) for each in distributions), strict=True)
+    return [(f"{at:.4g}", *(text for pair in pairs for text in rounded(*pair))) for at, *pairs in numbers]
 
 
 @warns_of_remarks
@@ -243,8 +243,8 @@ def _distributions(
     orthogonality = float(np.abs(gram / np.outer(scales, scales) - np.eye(scales.size)).max())
     try:
         others = [identified(unit.select([s for s in range(modes.n_modes) if s != r])) for r in range(modes.n_modes)]
-        of_mass, of_stiffness = ([other[i].coefficients for other in others] for i in (0, 1))
-        mass, stiffness = replace(mass, left_out=frozen(of_mass)), replace(stiffness, left_out=frozen(of_stiffness))
+        mass = replace(mass, left_out=frozen([other[0].coefficients for other in others]))
+        stiffness = replace(stiffness, left_out=frozen([other[1].coefficients for other in others]))
     except ValueError:
         pass  # too few relations without one of the modes
     return Distributions(mass, stiffness, frozen(scales / scale), modes.length, orthogonality)

@@ -47,8 +47,7 @@ class LossSettings:
 
     places: int = 60  # along the structure, at which losses are tried
     typical_width: float = 0.1  # of the length: its inverse is the number of independent places that are tested
-    # of the length: a search converges to a loss from half to twice its width
-    widths: tuple[float, ...] = (0.05, 0.1, 0.2, 0.4)
+    widths: tuple[float, ...] = (0.05, 0.1, 0.2, 0.4)  # of the length: a search converges from half to twice the width
     most_starts: int = 2  # of each width
     most_looks: int = 4  # searches along the structure after the first, at most
     first_terms: int = 3  # of mass and stiffness in the first search, at most
@@ -240,10 +239,9 @@ def _undamaged(candidates: Candidates, damaged: FittedStructure, threshold: floa
     """The best fit without a loss; a single fit where it suffices to decide the test."""
 
     def fit_of(*n_terms: int) -> FittedStructure | None:
-        try:
+        with suppress(ValueError):
             return fitted(candidates.problem(*n_terms), damaged)
-        except ValueError:
-            return None
+        return None
 
     equal_terms = fit_of(*damaged.n_terms)
     if equal_terms is not None and equal_terms.chi2 - damaged.chi2 <= threshold:

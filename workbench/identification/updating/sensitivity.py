@@ -32,16 +32,11 @@ APART = 1e-6  # least distance of nodes over the length
 
 @dataclass(frozen=True)
 class LocalLoss:
-    """A share of the stiffness lost over part of the structure.
+    """A share of the stiffness lost over part of the structure, which is cut off at the ends."""
 
-    Attributes:
-        share: δ of the stiffness there, below 1.
-        centre, width: of the part, m; the part is cut off at the ends of the structure.
-    """
-
-    share: float
-    centre: float
-    width: float
+    share: float  # δ of the stiffness there, below 1
+    centre: float  # of the part, m
+    width: float  # of the part, m
 
     def edges(self, length: float) -> tuple[float, float]:
         """Begin and end of the part within the structure, m."""

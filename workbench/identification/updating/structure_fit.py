@@ -16,7 +16,7 @@ from scipy.stats import chi2 as chi2_distribution
 from workbench.arrays import Floats, symmetric_root
 from workbench.identification.signal.modal_estimates import RefinedModes
 from workbench.identification.signal.searches import CachedResidual
-from workbench.identification.updating.distributions import Basis, SelfCheck, columns
+from workbench.identification.updating.distributions import Basis, SelfCheck, printed_rows
 from workbench.identification.updating.sensitivity import LocalLoss
 from workbench.identification.updating.structure_problem import PROBLEM, GaussianPrior, Problem, Task
 from workbench.renamed import Renamed
@@ -51,7 +51,7 @@ class UncertainProfile(Printed):
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         low, high = self.extent
         line = f"from {low:.4g} to {high:.4g} over {self.length:.4g} m"
-        return line, ("x [m]", "value", "±"), list(zip(*columns(self, self.length))), ()
+        return line, ("x [m]", "value", "±"), printed_rows(self.length, self), ()
 
     @property
     def extent(self) -> tuple[float, float]:
@@ -116,8 +116,7 @@ class FittedStructure(Printed):
             f" {verb} the {counted(self.numbers.size, 'mode')} measured (χ² {self.chi2:.4g}, at most {self.limit:.4g})"
         )
         k = "EI [N m²]" if isinstance(self.structure, Beam) else "EA [N]"
-        length = self.structure.length
-        rows = list(zip(*columns(self.mass, length), *columns(self.stiffness, length)[1:]))
+        rows = printed_rows(self.structure.length, self.mass, self.stiffness)
         return line, ("x [m]", "mass [kg/m]", "±", k, "±"), rows, self.remarks
 
     @property

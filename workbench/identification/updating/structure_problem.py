@@ -263,9 +263,8 @@ class Problem:
         coefficients = np.r_[d, e]
         for root, columns in self._prior_roots:
             rows.append(root @ coefficients[columns])
-            slope = np.zeros((len(root), slopes[0].shape[1]))
-            slope[:, columns] = root
-            slopes.append(slope)
+            slopes.append(np.zeros((len(root), slopes[0].shape[1])))
+            slopes[-1][:, columns] = root
         return np.concatenate(rows), np.vstack(slopes) @ self.coefficient_jacobian(z)
 
     def start(self) -> Floats:
