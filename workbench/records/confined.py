@@ -35,8 +35,7 @@ ROOT = str(Path(__file__).resolve().parents[2])
 def load_confined(module: str, path: Path, limits: ReadLimits = DEFAULT) -> dict[str, np.ndarray]:
     """The arrays that `load(path, limits)` of a module reads from a file, by name, in order.
 
-    Raises:
-        RecordFileError: the reader refused the file, crashed on it, took too long, or needed too much memory.
+    A reader that refuses the file, crashes on it, takes too long or too much memory is a `RecordFileError`.
     """
     seconds = limits.seconds
     threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # each reserves address space

@@ -54,10 +54,8 @@ class FrequencyResponses(Printed):
                 raise ValueError(f"{self.name}: {kind} names must differ; got {names}")
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
-        rows = [
-            (c.name, c.quantity, c.unit, place_text(c.at), f"{np.abs(values).max():.3g}")
-            for c, values in zip(self.output_channels, self.values, strict=True)
-        ]
+        each = zip(self.output_channels, self.values, strict=True)
+        rows = [(c.name, c.quantity, c.unit, place_text(c.at), f"{np.abs(values).max():.3g}") for c, values in each]
         f = self.frequencies_hz
         pairs = f"{counted(len(self.output_channels), 'output')} by {counted(len(self.references), 'reference')}"
         line = f"{self.name}: {pairs}, {f.size} lines, {f.min(initial=np.inf):.4g} to {f.max(initial=0.0):.4g} Hz"
@@ -70,11 +68,7 @@ class FrequencyResponses(Printed):
     only = Renamed("select_outputs")
 
     def select_outputs(self, outputs: tuple[str, ...]) -> "FrequencyResponses":
-        """The FRFs to some outputs, in that order.
-
-        Raises:
-            ValueError: an unknown output.
-        """
+        """The FRFs to some outputs, in that order; an unknown one is a ValueError."""
         rows = rows_of(self.name, self.output_names, outputs)
         channels = tuple(self.output_channels[row] for row in rows)
         return replace(self, values=self.values[rows], output_channels=channels)

@@ -44,9 +44,6 @@ def complex_columns(path: Path, signals: Mapping[str, np.ndarray]) -> dict[str, 
 
     Columns are real and imaginary parts, or magnitude (also in dB) and phase (in rad or degrees). Values are converted
     to SI by a known unit after the name or the part, as in `a [g/N] real`.
-
-    Raises:
-        RecordFileError: a table of frequencies in which a column lacks its other part.
     """
     names = list(signals)
     base, text = split_unit(names[0]) if names else ("", "")

@@ -158,11 +158,12 @@ def _scaled(path: Path, shapes: np.ndarray, arrays: Mapping[str, np.ndarray]) ->
         masses = _one_a_mode(path, "modal_mass", arrays["modal_mass"], n_modes)
     else:
         return shapes
-    if (r := _first(masses < 0)) is not None:
-        raise RecordFileError(f"{path}: modal_mass must be positive, kg; of mode {r + 1} it is {masses[r]:.6g}")
-    if (r := _first(~(masses > 0))) is not None:
+    if (negative := _first(masses < 0)) is not None:
+        which = f"of mode {negative + 1} it is {masses[negative]:.6g}"
+        raise RecordFileError(f"{path}: modal_mass must be positive, kg; {which}")
+    if (unstated := _first(~(masses > 0))) is not None:
         raise RecordFileError(
-            f"{path} states no modal mass of mode {r + 1}, so its shape has no scale; give"
+            f"{path} states no modal mass of mode {unstated + 1}, so its shape has no scale; give"
             " read_modes(path, modal_mass=...), 1.0 where the shapes are mass-normalised"
         )
     return shapes / np.sqrt(masses)

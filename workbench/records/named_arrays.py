@@ -37,9 +37,6 @@ def signals_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Signals:
 
     An array of two axes, one as long as the other signals, becomes several signals, `NAME 1` and so on. A single value
     named `fs`, or another of `SURE_RATES`, gives the time where no array does.
-
-    Raises:
-        RecordFileError: an array that is not rows of samples, two arrays of times, or numbered channels without header.
     """
     header = str(np.ravel(arrays[HEADER])[0]) if HEADER in arrays and np.size(arrays[HEADER]) else None
     time: np.ndarray | None = None

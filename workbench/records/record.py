@@ -219,18 +219,14 @@ class Record(Printed):
     def with_inputs(self, names: Sequence[str]) -> "Record":
         """The record with the named signals as inputs and all others as outputs, each in the order they had.
 
-        Without others, they are the outputs too.
-
-        Raises:
-            ValueError: an unknown name.
+        Without others, they are the outputs too. An unknown name is a ValueError.
         """
         channels, rows = (*self.input_channels, *self.output_channels), (*self.inputs, *self.outputs)
         there = [channel.name for channel in channels]
         for name in names:
             if name not in there:
-                raise ValueError(
-                    f"record {self.name!r} has no signal {name!r} to take as an input; it has {', '.join(there)}"
-                )
+                needed = f"no signal {name!r} to take as an input"
+                raise ValueError(f"record {self.name!r} has {needed}; it has {', '.join(there)}")
         into = [i for i, name in enumerate(there) if name in names]
         out = [i for i in range(len(there)) if i not in into] or into
         return replace(
@@ -285,11 +281,7 @@ class Record(Printed):
 
 
 def rows_of(owner: str, outputs: Sequence[str], names: Sequence[str]) -> list[int]:
-    """The rows of named outputs, in the order of the names; `owner` has the outputs, in words.
-
-    Raises:
-        ValueError: an unknown name.
-    """
+    """The rows of named outputs, in the order of the names; a name that `owner` (in words) does not have is refused."""
     row_of = {name: row for row, name in enumerate(outputs)}
     for name in names:
         if name not in row_of:

@@ -176,15 +176,10 @@ class SolvedSeries:
 class _Mesh:
     """The discretisation, with nodes at all places where something jumps, and at the edges of a loss.
 
-    Attributes:
-        segments: the functions.
-        x, weights: (n_points,) Gauss points and weights.
-        values, strains: (n_points, n_functions) functions and their highest derivatives there.
-        nominal_mass, nominal_stiffness: (n_points,) m_0 and k_0.
-        mass_terms, stiffness_terms: (n_points, n_terms) M_j and K_j.
-        checked_mass, checked_stiffness: the same where `member` checks that mass and stiffness are positive.
-        fixed_mass, fixed_stiffness: matrices of attachments, springs and tension.
-        free: indices of the functions that the ends do not hold.
+    At the Gauss points x, with weights (n_points,), it holds the functions and their highest derivatives, values and
+    strains (n_points, n_functions), m_0 and k_0 (n_points,), and the terms M_j and K_j (n_points, n_terms), these also
+    where `member` checks that mass and stiffness are positive; besides, the fixed matrices of attachments, springs and
+    tension, and the free functions, which the ends do not hold.
     """
 
     def __init__(self, series: SeriesStructure, edges: tuple[float, ...]) -> None:
