@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from workbench.identification.output_only.subspace import StablePole, Subspace
+from workbench.identification.output_only.subspace import Subspace
 from workbench.identification.signal.data_quality import check_outputs_move
 from workbench.identification.signal.harmonics import harmonic_remarks
 from workbench.identification.signal.modal_estimates import (
@@ -144,16 +144,26 @@ def identify_ambient(
     # A mode has a pole, a shape and an excitation, less a scale factor, at one of n_samples frequencies.
     limit = float(chi2.isf(false_alarm / record.n_samples, 4 * subspace.n_outputs))
     if n_modes is None:
-        modes = subspace.with_errors([mode for mode in stable if mode.statistic > limit], time_limit)
+        found = subspace.with_errors([mode for mode in stable if mode.statistic > limit], time_limit)
         resolution = 1.0 / (record.n_samples * record.sample_time)
         most_variance = AMBIENT.most_error**2 * resolution
-        modes = [mode for mode in modes if mode.variance[1, 1] < most_variance * abs(mode.pole.real)]
+        found = [mode for mode in found if mode.variance[1, 1] < most_variance * abs(mode.pole.real)]
     else:
-        modes = subspace.with_errors(sorted(stable, key=lambda mode: -mode.statistic)[:n_modes], time_limit)
-    if not modes or len(modes) < (n_modes or 0):
-        found = "no mode that rises" if n_modes is None else f"{len(modes)} stable modes, not {n_modes}, that rise"
-        raise ValueError(f"record {record.name!r} holds {found} above its noise; measure longer")
-    return _report(record, sorted(modes, key=lambda mode: abs(mode.pole)), limit, decays, time_limit)
+        found = subspace.with_errors(sorted(stable, key=lambda mode: -mode.statistic)[:n_modes], time_limit)
+    n = len(found)
+    if not n or n < (n_modes or 0):
+        which = "no mode that rises" if n_modes is None else f"{n} stable modes, not {n_modes}, that rise"
+        raise ValueError(f"record {record.name!r} holds {which} above its noise; measure longer")
+    found.sort(key=lambda mode: abs(mode.pole))
+    poles = np.array([mode.pole for mode in found])
+    covariance = np.zeros((2 * n, 2 * n))
+    for r, mode in enumerate(found):
+        jacobian = by_poles(poles[[r]])
+        covariance[np.ix_([r, n + r], [r, n + r])] = jacobian @ mode.variance @ jacobian.T
+    modes = SampledModes.of_poles(poles, _shapes(decays, poles), record.positions)
+    statistic = frozen([mode.statistic for mode in found])
+    remarks = (*_uneven_level(record), *harmonic_remarks([record], poles, range(n)), *time_limit.remarks)
+    return AmbientModes(modes, frozen(covariance), statistic, limit, decays, remarks)
 
 
 def _combinations(record: Record) -> np.ndarray:
@@ -164,21 +174,6 @@ def _combinations(record: Record) -> np.ndarray:
     centred = outputs - outputs.mean(axis=1, keepdims=True)
     vectors = np.linalg.eigh(centred @ centred.T)[1][:, -AMBIENT.most_directions :]
     return np.asarray(vectors.T @ centred)
-
-
-def _report(
-    record: Record, poles_found: Sequence[StablePole], limit: float, decays: tuple[Record, ...], time_limit: TimeLimit
-) -> AmbientModes:
-    poles = np.array([mode.pole for mode in poles_found])
-    n = poles.size
-    modes = SampledModes.of_poles(poles, _shapes(decays, poles), record.positions)
-    covariance = np.zeros((2 * n, 2 * n))
-    for r, mode in enumerate(poles_found):
-        jacobian = by_poles(poles[[r]])
-        covariance[np.ix_([r, n + r], [r, n + r])] = jacobian @ mode.variance @ jacobian.T
-    statistic = np.array([mode.statistic for mode in poles_found])
-    remarks = (*_uneven_level(record), *harmonic_remarks([record], poles, range(n)), *time_limit.remarks)
-    return AmbientModes(modes, frozen(covariance), frozen(statistic), limit, decays, remarks)
 
 
 def _uneven_level(record: Record) -> tuple[str, ...]:

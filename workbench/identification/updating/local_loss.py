@@ -91,13 +91,14 @@ class LocatedDamage(Printed):
     @property
     def detected(self) -> bool:
         """Whether a loss is detected: it is significant, explains the modes, and does so better than a point mass."""
-        return self.statistic > self.threshold and self._explains_roughly(self.damaged) and not self._is_mass
+        return self.statistic > self.threshold and self._explains_roughly(self.damaged) and self._by_mass is None
 
     @property
-    def _is_mass(self) -> bool:
-        """Whether a point mass explains the modes, and better than a loss."""
+    def _by_mass(self) -> FittedStructure | None:
+        """The fit with a point mass where it explains the modes, and better than a loss."""
         mass = self.with_mass
-        return mass is not None and mass.criterion < self.damaged.criterion and self._explains_roughly(mass)
+        better = mass is not None and mass.criterion < self.damaged.criterion and self._explains_roughly(mass)
+        return mass if better else None
 
     @staticmethod
     def _explains_roughly(fit: FittedStructure) -> bool:
@@ -112,9 +113,7 @@ class LocatedDamage(Printed):
     @property
     def best(self) -> FittedStructure:
         """The fit to use."""
-        if self.detected:
-            return self.damaged
-        return self.with_mass if self._is_mass and self.with_mass is not None else self.undamaged
+        return self.damaged if self.detected else self._by_mass or self.undamaged
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         test = f"statistic {self.statistic:.3g}, threshold {self.threshold:.3g}"
@@ -128,14 +127,13 @@ class LocatedDamage(Printed):
     @property
     def remarks(self) -> tuple[str, ...]:
         """Other explanations of the modes, and whether the modes are explained at all."""
-        remarks, loss, chi2_with_loss = [], self.damaged.loss, self.damaged.chi2
+        remarks, loss, chi2_with_loss, mass = [], self.damaged.loss, self.damaged.chi2, self._by_mass
         assert loss is not None, "damaged is an explanation with a loss"
-        if self.with_mass is not None and self._is_mass:
-            part = self.with_mass.structure.attachments[-1]
+        if mass is not None:
+            part = mass.structure.attachments[-1]
             remarks.append(
                 f"a point mass of {part.pair[0]:.3g} kg at {part.at:.4g} m, which the nominal structure lacks,"
-                f" explains the modes better than a loss: χ² {self.with_mass.chi2:.4g}, {chi2_with_loss:.4g} with the"
-                " loss"
+                f" explains the modes better than a loss: χ² {mass.chi2:.4g}, {chi2_with_loss:.4g} with the loss"
             )
         if not self.best.explains:
             place = f"{100 * loss.share:.2g} % at {loss.centre:.4g} m"
