@@ -115,7 +115,7 @@ def _split_ratio(name: str) -> tuple[str, str, str]:
     return (found[1], top, bottom) if unit_named(top) and unit_named(bottom) else (name, "", "")
 
 
-def frfs_of(path: Path, arrays: Mapping[str, np.ndarray], *, sample_rate_hz: float | None = None) -> FrequencyResponses:
+def frfs_of(path: Path, arrays: Mapping[str, np.ndarray], *, sample_rate_hz: float | None) -> FrequencyResponses:
     """The FRFs in the arrays of a file.
 
     Args:
@@ -179,8 +179,8 @@ def _lines_of_rate(
     if rate is None:
         name = next(iter(found))
         raise RecordFileError(
-            f"{path}, {name!r} is complex: FRFs? The file has no lines; add them as an array"
-            " 'frequency_hz', or give the sample rate if they go from zero to half of it"
+            f"{path}, {name!r} is complex: FRFs? The file has no lines; add them as an array 'frequency_hz', or give"
+            " the sample rate if they go from zero to half of it"
         )
     if not 0 < rate < np.inf:
         raise RecordFileError(f"{path}: the sample rate must be positive; got {rate:g}")

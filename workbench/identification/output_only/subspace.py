@@ -89,7 +89,7 @@ class Subspace:
                 distinct.append(mode)
         return distinct
 
-    def with_errors(self, modes: Sequence[StablePole], time_limit: TimeLimit | None = None) -> list[StablePole]:
+    def with_errors(self, modes: Sequence[StablePole], time_limit: TimeLimit) -> list[StablePole]:
         """The modes with their variance by the jackknife, from as many blocks as the time allows, four at least.
 
         The variance is scaled so that a normal interval of 95 % is that of Student's t with n_blocks - 1 degrees of
@@ -99,7 +99,7 @@ class Subspace:
             return []
         jackknife: list[list[np.ndarray]] = []
         for b in range(SUBSPACE.blocks):
-            if time_limit is not None and b >= SUBSPACE.least_blocks and time_limit.spent("standard errors"):
+            if b >= SUBSPACE.least_blocks and time_limit.spent("standard errors"):
                 break
             jackknife.append(self._poles_without(b, modes))
         n = len(jackknife)
