@@ -25,7 +25,7 @@ from workbench.identification.signal.data_quality import (
     of_same_sensors,
 )
 from workbench.identification.signal.harmonics import multiple_of, near_mains
-from workbench.identification.signal.modal_estimates import IdentifiedModes, RefinedEstimates, RefinedModes
+from workbench.identification.signal.modal_estimates import SURE, IdentifiedModes, RefinedEstimates, RefinedModes
 from workbench.identification.signal.projection import forget_transforms, power_of, power_sums, project
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Progress, TimeLimit
 from workbench.records.record import Record, as_records
@@ -57,7 +57,6 @@ class RingDownSettings:
 
 
 RING_DOWN = RingDownSettings()
-SURE = 3.0
 WITHIN_ERROR = "damping no larger than its error"
 
 

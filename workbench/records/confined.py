@@ -23,7 +23,7 @@ from workbench.records.limits import DEFAULT, ReadLimits, RecordFileError, check
 NAMES = "names"
 REFUSED, NO_MEMORY = 3, 4
 LONGEST_REFUSAL = 10_000  # bytes
-PATIENCE = 5.0  # limit of elapsed time over that of processor time, for a busy machine
+ELAPSED_RATIO = 5.0  # limit of elapsed time over that of processor time, for a busy machine
 OVERHEAD = 2**29  # bytes of address space of the interpreter and its libraries
 # -P keeps the working folder out of the path, so that a file called numpy.py there is not run
 CHILD = (
@@ -46,12 +46,12 @@ def load_confined(module: str, path: Path, limits: ReadLimits = DEFAULT) -> dict
                 stdin=subprocess.DEVNULL,
                 stdout=found,
                 stderr=subprocess.PIPE,
-                timeout=PATIENCE * seconds,
+                timeout=ELAPSED_RATIO * seconds,
                 env=os.environ | threads,
             )
         except subprocess.TimeoutExpired:
             raise RecordFileError(
-                f"{path} is damaged or too large: reading it did not end within {PATIENCE * seconds:.0f} s"
+                f"{path} is damaged or too large: reading it did not end within {ELAPSED_RATIO * seconds:.0f} s"
             ) from None
         found.seek(0)
         if ended.returncode == 0:
