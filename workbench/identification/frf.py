@@ -188,27 +188,22 @@ def identify_frf(
             break
         delays = estimate.delays + late
         estimate = _in_bands(h * np.exp(s * delays[:, None, None]), f, noise, channels, options)
-        late_again = frozen(estimate.fitted * np.exp(-s * delays[:, None, None]), complex)
-        estimate = replace(estimate, delays=frozen(delays), fitted=late_again)
+        fitted = frozen(estimate.fitted * np.exp(-s * delays[:, None, None]), complex)
+        estimate = replace(estimate, delays=frozen(delays), fitted=fitted)
     overlap = overlap_remarks(estimate.modes.poles, h.shape[0] * h.shape[1])
     deviation = estimate.modes.omega * estimate.zeta_std + 1j * estimate.omega_std
     overtones = overtone_remarks(
         estimate.modes.poles, np.sqrt(estimate.statistic), 2.0 * np.pi * estimate.scatter_hz, deviation
     )
     checks = (
-        *(
-            [
-                "the impulse responses come before the impulse, as in FRFs for e^(-iωt): their complex conjugates were"
-                " identified"
-            ]
-            if turned
-            else []
-        ),
         *_delay_remarks(estimate.delays, channels),
         *repeated_remarks(estimate),
         *set_up_remarks(estimate),
         *([] if noise is None else _noise_remark(estimate.misfit)),
     )
+    if turned:
+        as_conjugates = "as in FRFs for e^(-iωt): their complex conjugates were identified"
+        checks = (f"the impulse responses come before the impulse, {as_conjugates}", *checks)
     estimate = replace(
         estimate,
         remarks=(*checks, *estimate.remarks, *overlap, *_scatter_remark(estimate), *overtones, *time_limit.remarks),
