@@ -8,12 +8,12 @@ lag τ > 0 is a free decay of the structure (NExT: James, Carne & Lauffer, SAND9
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
 
-from workbench.identification.output_only.subspace import StablePole, Subspace
+from workbench.identification.output_only.subspace import Subspace
 from workbench.identification.signal.data_quality import check_outputs_move
 from workbench.identification.signal.harmonics import harmonic_remarks
 from workbench.identification.signal.modal_estimates import (
@@ -24,7 +24,7 @@ from workbench.identification.signal.modal_estimates import (
 )
 from workbench.identification.signal.projection import project
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Progress, TimeLimit, check_count
-from workbench.records.record import Channel, Record
+from workbench.records.record import Record
 from workbench.renamed import Renamed, former_arguments
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread
@@ -93,7 +93,19 @@ def correlation_functions(
         ValueError: an output that never moves; an unknown reference; a record shorter than forty times `max_lag`.
     """
     check_outputs_move([record])
-    return _decays(record, max_lag, references)
+    lags, rows = _lags(record, max_lag, references)
+    correlations = _correlations(record, lags, rows) / record.n_samples
+    std = record.outputs.std(axis=1)  # for equal weights of the references
+    return tuple(
+        Record(
+            record.sample_time,
+            values / std[j],
+            tuple(replace(channel, noise_std=None) for channel in record.output_channels),
+            start_time=record.sample_time,
+            name=f"{record.name} with {record.output_names[j]}",
+        )
+        for j, values in zip(rows, correlations, strict=True)
+    )
 
 
 @former_arguments(longest="max_lag")
@@ -125,24 +137,33 @@ def identify_ambient(
         ValueError: as `correlation_functions`; no mode found, or fewer than asked for.
     """
     check_count("n_modes", n_modes)
-    check_outputs_move([record])
     time_limit = TimeLimit(seconds, progress)
-    decays = _decays(record, max_lag, references)
+    decays = correlation_functions(record, max_lag=max_lag, references=references)
     subspace = Subspace(_combinations(record), record.sample_time)
     stable = subspace.stable()
     # A mode has a pole, a shape and an excitation, less a scale factor, at one of n_samples frequencies.
     limit = float(chi2.isf(false_alarm / record.n_samples, 4 * subspace.n_outputs))
     if n_modes is None:
-        modes = subspace.with_errors([mode for mode in stable if mode.statistic > limit], time_limit)
+        found = subspace.with_errors([mode for mode in stable if mode.statistic > limit], time_limit)
         resolution = 1.0 / (record.n_samples * record.sample_time)
         most_variance = AMBIENT.most_error**2 * resolution
-        modes = [mode for mode in modes if mode.variance[1, 1] < most_variance * abs(mode.pole.real)]
+        found = [mode for mode in found if mode.variance[1, 1] < most_variance * abs(mode.pole.real)]
     else:
-        modes = subspace.with_errors(sorted(stable, key=lambda mode: -mode.statistic)[:n_modes], time_limit)
-    if not modes or len(modes) < (n_modes or 0):
-        found = "no mode that rises" if n_modes is None else f"{len(modes)} stable modes, not {n_modes}, that rise"
-        raise ValueError(f"record {record.name!r} holds {found} above its noise; measure longer")
-    return _report(record, sorted(modes, key=lambda mode: abs(mode.pole)), limit, decays, time_limit)
+        found = subspace.with_errors(sorted(stable, key=lambda mode: -mode.statistic)[:n_modes], time_limit)
+    n = len(found)
+    if not n or n < (n_modes or 0):
+        which = "no mode that rises" if n_modes is None else f"{n} stable modes, not {n_modes}, that rise"
+        raise ValueError(f"record {record.name!r} holds {which} above its noise; measure longer")
+    found.sort(key=lambda mode: abs(mode.pole))
+    poles = np.array([mode.pole for mode in found])
+    covariance = np.zeros((2 * n, 2 * n))
+    for r, mode in enumerate(found):
+        jacobian = by_poles(poles[[r]])
+        covariance[np.ix_([r, n + r], [r, n + r])] = jacobian @ mode.variance @ jacobian.T
+    modes = SampledModes.of_poles(poles, _shapes(decays, poles), record.positions)
+    statistic = frozen([mode.statistic for mode in found])
+    remarks = (*_uneven_level(record), *harmonic_remarks([record], poles, range(n)), *time_limit.remarks)
+    return AmbientModes(modes, frozen(covariance), statistic, limit, decays, remarks)
 
 
 def _combinations(record: Record) -> np.ndarray:
@@ -153,21 +174,6 @@ def _combinations(record: Record) -> np.ndarray:
     centred = outputs - outputs.mean(axis=1, keepdims=True)
     vectors = np.linalg.eigh(centred @ centred.T)[1][:, -AMBIENT.most_directions :]
     return np.asarray(vectors.T @ centred)
-
-
-def _report(
-    record: Record, poles_found: Sequence[StablePole], limit: float, decays: tuple[Record, ...], time_limit: TimeLimit
-) -> AmbientModes:
-    poles = np.array([mode.pole for mode in poles_found])
-    n = poles.size
-    modes = SampledModes.of_poles(poles, _shapes(decays, poles), record.positions)
-    covariance = np.zeros((2 * n, 2 * n))
-    for r, mode in enumerate(poles_found):
-        jacobian = by_poles(poles[[r]])
-        covariance[np.ix_([r, n + r], [r, n + r])] = jacobian @ mode.variance @ jacobian.T
-    statistic = np.array([mode.statistic for mode in poles_found])
-    remarks = (*_uneven_level(record), *harmonic_remarks([record], poles, range(n)), *time_limit.remarks)
-    return AmbientModes(modes, frozen(covariance), frozen(statistic), limit, decays, remarks)
 
 
 def _uneven_level(record: Record) -> tuple[str, ...]:
@@ -198,7 +204,8 @@ def _lags(record: Record, max_lag: float | None, references: Sequence[str] | Non
         rows = sorted(int(j) for j in strongest)
     else:
         rows = [record.output_names.index(name) for name in record.select_outputs(references).output_names]
-    most, least = record.n_samples // AMBIENT.least_length, AMBIENT.least_lags // 4
+    width = AMBIENT.least_lags
+    most, least = record.n_samples // AMBIENT.least_length, width // 4
     if most < least:
         raise ValueError(
             f"record {record.name!r} has {record.n_samples} samples; modes of random vibration take at least"
@@ -214,15 +221,9 @@ def _lags(record: Record, max_lag: float | None, references: Sequence[str] | Non
     if max_lag is None:
         correlations = _correlations(record, 4 * lags, rows)
         energy = (correlations / correlations.std(axis=2, keepdims=True)) ** 2
-        windows = (
-            energy.sum(axis=(0, 1))[: 4 * lags // AMBIENT.least_lags * AMBIENT.least_lags]
-            .reshape(-1, AMBIENT.least_lags)
-            .mean(axis=1)
-        )
+        windows = energy.sum(axis=(0, 1))[: 4 * lags // width * width].reshape(-1, width).mean(axis=1)
         errors = np.median(windows[windows.size // 2 :])
-        lags = min(
-            lags, AMBIENT.least_lags * max(1, int(np.argmax(np.r_[windows, 0.0] < AMBIENT.above_errors * errors)))
-        )
+        lags = min(lags, width * max(1, int(np.argmax(np.r_[windows, 0.0] < AMBIENT.above_errors * errors))))
     return lags, rows
 
 
@@ -232,20 +233,3 @@ def _correlations(record: Record, lags: int, rows: list[int]) -> np.ndarray:
     size = 2 ** int(np.ceil(np.log2(record.n_samples + lags)))
     outputs, references = np.fft.rfft(centred, size), np.fft.rfft(centred[rows], size)
     return np.ascontiguousarray(np.fft.irfft(references.conj()[:, None] * outputs, size)[..., 1 : lags + 1])
-
-
-def _decays(record: Record, max_lag: float | None, references: Sequence[str] | None) -> tuple[Record, ...]:
-    """Correlation functions as records, one per reference, over its standard deviation for equal weights."""
-    lags, rows = _lags(record, max_lag, references)
-    correlations = _correlations(record, lags, rows) / record.n_samples
-    std = record.outputs.std(axis=1)
-    return tuple(
-        Record(
-            record.sample_time,
-            values / std[j],
-            tuple(Channel(c.name, c.quantity, c.unit, c.at) for c in record.output_channels),
-            start_time=record.sample_time,
-            name=f"{record.name} with {record.output_names[j]}",
-        )
-        for j, values in zip(rows, correlations, strict=True)
-    )

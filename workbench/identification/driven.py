@@ -64,16 +64,8 @@ from workbench.rig.statespace import signal_names
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread
 
-
-@dataclass(frozen=True)
-class DrivenSettings:
-    """Constants of the stages of an identification from known inputs."""
-
-    driven_share: float = 0.3  # share of the motion of a mode due to the inputs, below which they do not drive it
-    final_seconds: float = 5.0  # of processor time for the last check of modes, even after the search used up its time
-
-
-DRIVEN = DrivenSettings()
+DRIVEN_SHARE = 0.3  # share of the motion of a mode due to the inputs, below which they do not drive it
+FINAL_SECONDS = 5.0  # of processor time for the last check of modes, even after the search used up its time
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -134,10 +126,7 @@ class DrivenModes(ParticipatingModes):
         and outputs have the names of the record's channels.
         """
         n, poles = self.modes.n_modes, self.modes.poles
-        a = np.zeros((2 * n, 2 * n))
-        even, odd = 2 * np.arange(n), 2 * np.arange(n) + 1
-        a[even, even] = a[odd, odd] = poles.real
-        a[even, odd], a[odd, even] = -poles.imag, poles.imag
+        a = np.kron(np.diag(poles.real), np.eye(2)) + np.kron(np.diag(poles.imag), [[0.0, -1.0], [1.0, 0.0]])
         b = np.stack([self.participation.real, self.participation.imag], axis=1).reshape(2 * n, -1)
         c = 2.0 * self._measured_shapes
         c = np.stack([c.real, -c.imag], axis=2).reshape(c.shape[0], 2 * n)
@@ -277,7 +266,7 @@ def identify_driven(
     if data.clock:
         logged, records = ([on_inputs_clock(record, data.clock) for record in each] for each in (logged, records))
     data, selected, changing = _as_time_invariant(data, selected, time_limit)
-    selected = only_predictive(data, selected, TimeLimit(DRIVEN.final_seconds))
+    selected = only_predictive(data, selected, TimeLimit(FINAL_SECONDS))
     selected, remarks = _without_artefacts(data, selected, time_limit)
     if delays is None:
         remarks = (*delay_remarks(data), *remarks)
@@ -293,13 +282,8 @@ def identify_driven(
     distorted = (*selected.distorted, *left_about(data, fit))
     unexplained = [pole for pole in distorted if pole not in (*explained, *by_amplitude.changing)]
     changes = (*changes, *unpredictive_remarks(fit, unexplained))
-    driven = _report(
-        logged,
-        records,
-        data,
-        selected,
-        (*clipped, *clocks, *bursts, *windowed, *drift, *holds, *remarks, *overlap, *changes, *time_limit.remarks),
-    )
+    doubts = (*clipped, *clocks, *bursts, *windowed, *drift, *holds, *remarks, *overlap, *changes, *time_limit.remarks)
+    driven = _report(logged, records, data, selected, doubts)
     deviation = driven.modes.omega * driven.zeta_std + 1j * driven.omega_std
     decays = by_amplitude.remarks(fit.poles, _response_sizes(data, fit), deviation)
     # The response of a mode to the inputs may have a constant amplitude without being harmonic excitation.
@@ -317,26 +301,18 @@ def _is_steady_and_undriven(data: KnownInputs, fit: Fit, r: int) -> bool:
     l_r[data.n_inputs :] = 0.0
     by_inputs = np.linalg.norm(modal_coordinate(responses, l_r))
     decays = -pole.real * 2.0 * np.pi / data.resolution
-    return bool(decays < 1.0 and by_inputs < DRIVEN.driven_share * norm)
+    return bool(decays < 1.0 and by_inputs < DRIVEN_SHARE * norm)
 
 
 def _response_sizes(data: KnownInputs, fit: Fit) -> Floats:
     """Norm of the response of each mode over all records, outputs in units of their noise, (n_modes,)."""
-    each = zip(fit.poles, fit.participation, fit.amplitudes.T, strict=True)
-    return np.array(
-        [
-            np.linalg.norm(a / fit.noise) * np.linalg.norm(np.concatenate(data.modal_coordinate(p, l_r)))
-            for p, l_r, a in each
-        ]
-    )
+    coordinates = (np.concatenate(data.modal_coordinate(*each)) for each in zip(fit.poles, fit.participation))
+    scaled = fit.amplitudes.T / fit.noise
+    return np.array([np.linalg.norm(a) * np.linalg.norm(z) for a, z in zip(scaled, coordinates, strict=True)])
 
 
 def _checked_delays(records: Sequence[Record], delays: ArrayLike) -> np.ndarray:
-    """Delay of each input in samples, (n_inputs,), from delays in s.
-
-    Raises:
-        ValueError: a delay that is negative or longer than a quarter of the shortest record.
-    """
+    """Delay of each input in samples, (n_inputs,), from delays in s."""
     dt, given = records[0].sample_time, np.broadcast_to(np.asarray(delays, float), (records[0].n_inputs,))
     longest = 0.25 * min(record.n_samples for record in records) * dt
     if not ((given >= 0) & (given <= longest)).all():
@@ -353,7 +329,7 @@ def _as_time_invariant(
     """The modes refitted as time-invariant, without the columns of changing modes, and the poles that change.
 
     Noise, standard errors and responses are then those of the model returned. No mode counts as changing if these
-    columns, in addition to all modes, explain no more than they would of noise.
+    columns explain no more than they would of noise.
     """
     if not data.changing:
         return data, selected, ()
@@ -398,9 +374,7 @@ def _report(
 ) -> DrivenModes:
     """The result, with the noise of the inputs, where there is some, in its standard errors.
 
-    Args:
-        logged, records: as measured, and with the force window.
-        data: of the records, weighted by their noise.
+    `logged` are the records as measured, `records` those with the force window.
     """
     fit, n, from_inputs = selected.fit, selected.fit.poles.size, None
     if data.measured is None:
@@ -424,6 +398,7 @@ def _report(
     derivative = time_derivatives(channels)[:, None]
     shapes, participation = scaled_vectors(fit, np.arange(n), derivative)
     vectors = vector_covariance(fit, noise_ratio, derivative, np.arange(n), n_inputs, from_inputs)
+    initial = np.zeros((len(records), n)) if data.at_rest else participation[:, n_inputs:].T
     direct = np.zeros((len(channels), n_inputs))
     direct_std = np.zeros_like(direct)
     if data.has_direct:
@@ -439,10 +414,7 @@ def _report(
         delays=frozen(data.delays * data.dt),
         input_hold=data.hold,
         sample_time=data.dt,
-        initial=tuple(
-            frozen(np.zeros(n) if data.at_rest else participation[:, n_inputs + k], complex)
-            for k in range(len(records))
-        ),
+        initial=tuple(frozen(column, complex) for column in initial),
         noise=frozen(data.noise(fit)),
         statistic=frozen(selected.statistic),
         threshold=selected.limit,

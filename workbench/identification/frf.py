@@ -134,11 +134,6 @@ def coherence_noise(frf: ArrayLike, coherence: ArrayLike, *, averages: int) -> n
     return np.asarray(np.abs(h) * np.sqrt((1.0 - squared) / (2.0 * squared * averages)))
 
 
-TURNED = (
-    "the impulse responses come before the impulse, as in FRFs for e^(-iωt): their complex conjugates were identified"
-)
-
-
 @former_arguments(most_modes="max_modes", transfer="frf")
 @one_blas_thread
 def identify_frf(
@@ -193,23 +188,22 @@ def identify_frf(
             break
         delays = estimate.delays + late
         estimate = _in_bands(h * np.exp(s * delays[:, None, None]), f, noise, channels, options)
-        estimate = replace(
-            estimate,
-            delays=frozen(delays),
-            fitted=frozen(estimate.fitted * np.exp(-s * delays[:, None, None]), complex),
-        )
+        fitted = frozen(estimate.fitted * np.exp(-s * delays[:, None, None]), complex)
+        estimate = replace(estimate, delays=frozen(delays), fitted=fitted)
     overlap = overlap_remarks(estimate.modes.poles, h.shape[0] * h.shape[1])
     deviation = estimate.modes.omega * estimate.zeta_std + 1j * estimate.omega_std
     overtones = overtone_remarks(
         estimate.modes.poles, np.sqrt(estimate.statistic), 2.0 * np.pi * estimate.scatter_hz, deviation
     )
     checks = (
-        *([TURNED] if turned else []),
         *_delay_remarks(estimate.delays, channels),
         *repeated_remarks(estimate),
         *set_up_remarks(estimate),
         *([] if noise is None else _noise_remark(estimate.misfit)),
     )
+    if turned:
+        as_conjugates = "as in FRFs for e^(-iωt): their complex conjugates were identified"
+        checks = (f"the impulse responses come before the impulse, {as_conjugates}", *checks)
     estimate = replace(
         estimate,
         remarks=(*checks, *estimate.remarks, *overlap, *_scatter_remark(estimate), *overtones, *time_limit.remarks),
@@ -224,11 +218,7 @@ def identify_frf(
 
 
 def _in_bands(
-    h: np.ndarray,
-    f: np.ndarray,
-    noise: np.ndarray | None,
-    channels: Sequence[Channel],
-    options: SelectionOptions,
+    h: np.ndarray, f: np.ndarray, noise: np.ndarray | None, channels: Sequence[Channel], options: SelectionOptions
 ) -> FrfModes:
     """The modes of all lines; more than `FRF.most_lines` are fitted band by band."""
     n_bands, lines_a_mode = (1, 3) if f.size <= FRF.most_lines else (-(-f.size // FRF.band), FRF.lines_a_mode)
@@ -238,12 +228,8 @@ def _in_bands(
         first, last = round(k * share), round((k + 1) * share)
         inside = slice(max(first - FRF.overlap_lines, 0), last + FRF.overlap_lines)
         edges = f[first] if k else 0.0, f[last] if last < f.size else np.inf
-        lines = Lines(
-            h[..., inside],
-            2.0 * np.pi * f[inside],
-            _residual_powers(channels),
-            None if noise is None else noise[..., inside],
-        )
+        noise_inside = None if noise is None else noise[..., inside]
+        lines = Lines(h[..., inside], 2.0 * np.pi * f[inside], _residual_powers(channels), noise_inside)
         most = min(options.max_modes, lines.omega.size // lines_a_mode)
         selected = _select_in_band(lines, SelectionOptions(most, options.false_alarm / n_bands, band_budget))
         return _modes_of(*selected, channels, edges, f[first:last])
@@ -272,12 +258,8 @@ def _output_delays(estimate: FrfModes, channels: Sequence[Channel], least: float
 
 
 def _delay_remarks(delays: Floats, channels: Sequence[Channel]) -> tuple[str, ...]:
-    late = [f"{c.name} {d:.3g} s" for c, d in zip(channels, delays, strict=True) if d]
-    return (
-        (f"outputs are delayed relative to the inputs, by {', '.join(late)}: the modes are corrected for it",)
-        if late
-        else ()
-    )
+    late = ", ".join(f"{c.name} {d:.3g} s" for c, d in zip(channels, delays, strict=True) if d)
+    return (f"outputs are delayed relative to the inputs, by {late}: the modes are corrected for it",) if late else ()
 
 
 def _select_in_band(lines: Lines, options: SelectionOptions) -> tuple[Lines, SelectedModes]:
@@ -332,9 +314,9 @@ def _select_weighted(lines: Lines, selected: SelectedModes, options: SelectionOp
     before: np.ndarray | None = None
     for _ in range(FRF.noise_rounds):
         guessed = relative_noise(lines, selected.fit)
-        if guessed is None or (
-            before is not None and np.log(guessed / before).std(axis=(1, 2)).max() < FRF.alike  # up to a factor
-        ):
+        if guessed is None:
+            break
+        if before is not None and np.log(guessed / before).std(axis=(1, 2)).max() < FRF.alike:  # up to a factor
             break
         if time_limit.spent("estimation of the noise"):
             return lines, selected
@@ -356,14 +338,9 @@ def _modes_of(
     edges_hz: tuple[float, float],
     shown_hz: np.ndarray,
 ) -> FrfModes:
-    """The result for a band.
+    """The result for a band, from the lines of the band and its overlap and their modes.
 
-    Args:
-        lines: of the band and its overlap.
-        selected: their modes.
-        channels: of the outputs.
-        edges_hz: frequencies between which modes are reported, Hz.
-        shown_hz: (n_frequencies,) lines at which the fit is reported, Hz.
+    Modes are reported between `edges_hz`, the fit at the lines `shown_hz` (n_frequencies,).
     """
     fit, cluster_hz = _clustered(lines, selected, channels)
     peak_shapes = peaks(lines, fit)
@@ -381,7 +358,8 @@ def _modes_of(
     within = (fit.poles.imag >= lines.omega[0]) & (fit.poles.imag <= lines.omega[-1])
     within &= (damped_hz >= edges_hz[0]) & (damped_hz < edges_hz[1])
     inside = np.flatnonzero(within & sure)
-    left_out = ", ".join(f"{f:.4g}" for f in damped_hz[within & ~sure])
+    unsure = ", ".join(f"{f:.4g}" for f in damped_hz[within & ~sure])
+    left_out = [f"left out, as negatively damped or of unknown frequency: poles at {unsure} Hz"] if unsure else []
     derivative, poles = time_derivatives(channels)[:, None], fit.poles[inside]
     shapes, participation = scaled_vectors(fit, inside, derivative)
     vectors = vector_covariance(fit, noise_ratio, derivative, inside, lines.n_inputs)
@@ -405,10 +383,7 @@ def _modes_of(
         lower_residual_std=frozen(below_std),
         upper_residual=frozen(above),
         delays=frozen(np.zeros(len(channels))),
-        remarks=(
-            *([f"left out, as negatively damped or of unknown frequency: poles at {left_out} Hz"] if left_out else []),
-            *_window_remark(lines.window_rate),
-        ),
+        remarks=(*left_out, *_window_remark(lines.window_rate)),
     )
 
 
@@ -427,14 +402,12 @@ def _residual_terms(
     if low.any():  # the error of the sum of these poles and E, as they are not determined separately
         weights = np.ones((len(lines.fixed), 1)) if lines.weights is None else lines.weights
         std = fit.noise / np.sqrt((lines.fixed**2).T @ weights**2)
-    terms, errors = (
-        x[:size].reshape(lines.n_inputs, len(scale), -1) * scale[:, None] for x in (fit.coefficients[n:], std)
-    )
+    both = fit.coefficients[n:], std
+    terms, errors = (x[:size].reshape(lines.n_inputs, len(scale), -1) * scale[:, None] for x in both)
     below, below_std, above = (np.zeros((len(derivative), lines.n_inputs)) for _ in range(3))
     # For each derivative: terms in s^(k - 2) of the poles below the band, less those of the poles within it.
-    pole_terms = (
-        np.stack([fit.amplitudes * x for x in (low * fit.poles, low, (low - 1.0) / fit.poles)]) @ fit.participation
-    )
+    factors = low * fit.poles, low, (low - 1.0) / fit.poles
+    pole_terms = np.stack([fit.amplitudes * x for x in factors]) @ fit.participation
     for j, order in enumerate(derivative):
         if order in lines.powers:
             above[j] = terms[:, lines.powers.index(order), j]
@@ -474,24 +447,21 @@ def _noise_remark(misfit: Floats) -> tuple[str, ...]:
 
 def _scatter_remark(estimate: FrfModes) -> tuple[str, ...]:
     """A remark on modes whose peak in the FRFs is not that of a single pole."""
-    which = [
-        mode_text(r, estimate.modes.frequencies_hz[r], f", by {scatter:.3g} Hz rms")
-        for r, scatter in enumerate(estimate.scatter_hz)
-        if scatter > 0
-    ]
+    hz = estimate.modes.frequencies_hz
+    each = enumerate(zip(hz, estimate.scatter_hz, strict=True))
+    which = [mode_text(r, f, f", by {scatter:.3g} Hz rms") for r, (f, scatter) in each if scatter > 0]
     if not which:
         return ()
-    lines = 2.0 * estimate.modes.zeta * estimate.modes.frequencies_hz / np.diff(estimate.frequencies_hz).min()
+    lines = 2.0 * estimate.modes.zeta * hz / np.diff(estimate.frequencies_hz).min()
     narrow = [str(r + 1) for r in np.flatnonzero((estimate.scatter_hz > 0) & (lines < FRF.resolved))]
     leaks = (
         f". Fewer than {FRF.resolved:g} lines lie in the half-power bandwidth of mode{'s' * (len(narrow) > 1)}"
-        f" {', '.join(narrow)}: if"
-        " these are averages by Hann's window, its leakage makes that damping too high"
+        f" {', '.join(narrow)}: if these are averages by Hann's window, its leakage makes that damping too high"
     )
     return (
         f"frequencies scatter in the peaks of {', '.join(which)}: such a mode changes with time or amplitude, or a"
         " window blurs it, and its frequency and damping are means; measure at one level, and longer segments"
-        + (leaks if narrow else ""),
+        f"{leaks if narrow else ''}",
     )
 
 
@@ -523,20 +493,24 @@ def _joined(bands: Sequence[FrfModes], channels: Sequence[Channel]) -> FrfModes:
     kept = np.r_[first, first + np.repeat(n, n)]
     omega, zeta = (np.concatenate([getattr(modes, name) for modes in modes_by_band]) for name in ("omega", "zeta"))
     shapes = np.hstack([modes.shapes for modes in modes_by_band])
+
+    def together(name: str, axis: int = 0, dtype: type = float) -> np.ndarray:
+        return frozen(np.concatenate([getattr(band, name) for band in bands], axis), dtype)
+
     share = np.array([band.frequencies_hz.size for band in bands]) / sum(band.frequencies_hz.size for band in bands)
     return FrfModes(
         modes=SampledModes(omega, zeta, shapes, _places(channels)),
         covariance=frozen(covariance[np.ix_(kept, kept)]),
-        vector_covariance=frozen(np.concatenate([band.vector_covariance for band in bands])),
-        participation=frozen(np.vstack([band.participation for band in bands]), complex),
+        vector_covariance=together("vector_covariance"),
+        participation=together("participation", dtype=complex),
         misfit=frozen(np.sqrt(share @ np.array([band.misfit for band in bands]) ** 2)),
-        statistic=frozen(np.concatenate([band.statistic for band in bands])),
+        statistic=together("statistic"),
         converged=all(band.converged for band in bands),
         cluster_hz=tuple(parts for band in bands for parts in band.cluster_hz),
-        scatter_hz=frozen(np.concatenate([band.scatter_hz for band in bands])),
+        scatter_hz=together("scatter_hz"),
         order_limited_hz=tuple(full for band in bands for full in band.order_limited_hz),
-        fitted=frozen(np.concatenate([band.fitted for band in bands], axis=-1), complex),
-        frequencies_hz=frozen(np.concatenate([band.frequencies_hz for band in bands])),
+        fitted=together("fitted", -1, complex),
+        frequencies_hz=together("frequencies_hz"),
         lower_residual=bands[0].lower_residual,
         lower_residual_std=bands[0].lower_residual_std,
         upper_residual=bands[-1].upper_residual,
@@ -548,8 +522,7 @@ def _joined(bands: Sequence[FrfModes], channels: Sequence[Channel]) -> FrfModes:
 def _residual_powers(channels: Sequence[Channel]) -> list[int]:
     """Powers of s in the residual terms of modes above and below the band."""
     measured = {k for k, c in zip(time_derivatives(channels), channels, strict=True) if c.quantity in MEASURED}
-    above = measured or {0, 2}
-    return sorted({int(power) for k in above for power in (k, k - 2)})
+    return sorted({int(power) for k in measured or {0, 2} for power in (k, k - 2)})
 
 
 def _places(channels: Sequence[Channel]) -> np.ndarray:
@@ -572,12 +545,13 @@ def _checked(
         )
     if not np.isfinite(f).all() or (np.diff(f) <= 0).any():
         raise ValueError("FRFs need finite frequencies that increase; sort them, each once")
-    noise = None if noise_std is None else np.asarray(noise_std, float)
-    if noise is not None and noise.shape not in ((), np.shape(frf)):
-        raise ValueError(f"noise_std must have the shape of frf, {np.shape(frf)}; got {noise.shape}")
-    noise = None if noise is None else np.broadcast_to(noise, np.shape(frf)).reshape(h.shape)
-    if noise is not None and not ((noise > 0) & np.isfinite(noise)).all():
-        raise ValueError("noise_std must be positive and finite at every line; give lines without noise a floor")
+    noise: np.ndarray | None = None
+    if noise_std is not None:
+        if np.shape(noise_std) not in ((), np.shape(frf)):
+            raise ValueError(f"noise_std must have the shape of frf, {np.shape(frf)}; got {np.shape(noise_std)}")
+        noise = np.broadcast_to(np.asarray(noise_std, float), np.shape(frf)).reshape(h.shape)
+        if not ((noise > 0) & np.isfinite(noise)).all():
+            raise ValueError("noise_std must be positive and finite at every line; give lines without noise a floor")
     low, high = (0.0, np.inf) if band_hz is None else band_hz
     keep = (f >= low) & (f <= high) & (f > 0)
     if keep.sum() < 12:

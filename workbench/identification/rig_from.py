@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -28,6 +27,12 @@ RIGID_SHARE, RIGID_ERRORS = 0.1, 5.0
 # four times its frequency.
 NEGLIGIBLE, DOMINANT = 0.02, 0.5
 STEP = 1e-3  # of the finite differences in the propagation of errors, in standard errors
+# Points; mass-normalised shapes there (n_points, n_modes), identified first, then rigid ones; and their covariance
+# (n_modes, n_points, n_points), None where it is unknown.
+Shapes = tuple[NamedPoints, np.ndarray, np.ndarray | None]
+# The sum Σ φ_j φ_i of rigid modes, its standard errors, (n_outputs, n_inputs) each, and the norm up to which a part of
+# it is insignificant.
+RigidTerm = tuple[np.ndarray, np.ndarray, float]
 
 
 def rig_from(
@@ -73,7 +78,6 @@ def rig_from(
     """
     modes = identified.modes
     out_channels = _channels(identified, "output_channels", outputs, modes.shapes.shape[0])
-    measured = [channel.quantity for channel in out_channels]
     for channel in out_channels:
         if channel.quantity not in MEASURED:
             raise ValueError(
@@ -82,26 +86,28 @@ def rig_from(
             )
     if isinstance(identified, DrivenModes | FrfModes):
         in_channels = _channels(identified, "input_channels", inputs, identified.participation.shape[1])
-        shapes = _shapes_of_residues(identified, out_channels, in_channels, driving_point, modal_masses)
+        points, shapes, shape_covariance = _shapes_of_residues(
+            identified, out_channels, in_channels, driving_point, modal_masses
+        )
         delays = identified.delays if isinstance(identified, DrivenModes) else np.zeros(len(in_channels))
         actuators = tuple(
             Actuator(c.name, c.name, quantity="moment" if c.quantity == "moment" else "force", delay=float(delay))
             for c, delay in zip(in_channels, delays, strict=True)
         )
     else:
-        shapes = _shapes_of_outputs(identified, out_channels, modal_masses)
+        points, shapes, shape_covariance = _shapes_of_outputs(identified, out_channels, modal_masses)
         names = [channel if isinstance(channel, str) else channel.name for channel in inputs or ()]
-        shapes.points.locate(names)
+        points.locate(names)
         actuators = tuple(Actuator(f"force at {name}", name) for name in names)
     noise = getattr(identified, "noise_std", [channel.noise_std or 0.0 for channel in out_channels])
     late = identified.delays if isinstance(identified, FrfModes) else np.zeros(len(out_channels))
     sensors = tuple(
-        Sensor(c.name, c.name, quantity, noise_std=float(std), delay=float(delay))
-        for c, quantity, std, delay in zip(out_channels, measured, np.atleast_1d(noise), late, strict=True)
+        Sensor(c.name, c.name, c.quantity, noise_std=float(std), delay=float(delay))
+        for c, std, delay in zip(out_channels, np.atleast_1d(noise), late, strict=True)
     )
     n = modes.n_modes
     # rigid modes come last in `shapes`
-    omega, zeta = (np.append(figure, np.zeros(shapes.values.shape[1] - n)) for figure in (modes.omega, modes.zeta))
+    omega, zeta = (np.append(figure, np.zeros(shapes.shape[1] - n)) for figure in (modes.omega, modes.zeta))
     covariance, known = np.zeros((2 * omega.size,) * 2), np.r_[:n, omega.size : omega.size + n]
     covariance[np.ix_(known, known)] = identified.covariance
     order = np.argsort(omega, kind="stable")
@@ -109,23 +115,16 @@ def rig_from(
     modes_found = Modes(
         omega=omega[order],
         damping=zeta[order],
-        shapes=PointShapes(shapes.values[:, order]),
-        domain=shapes.points,
+        shapes=PointShapes(shapes[:, order]),
+        domain=points,
         covariance=covariance[np.ix_(both, both)],
-        shape_covariance=None if shapes.covariance is None else shapes.covariance[order],
+        shape_covariance=None if shape_covariance is None else shape_covariance[order],
     )
     return Rig(modes_found, actuators, sensors)
 
 
 def _channels(identified: Any, name: str, given: Sequence[Channel | str] | None, count: int) -> tuple[Channel, ...]:
-    """The channels of inputs or outputs, given or as kept by the identification.
-
-    Args:
-        identified: the result of an identification.
-        name: "input_channels" or "output_channels".
-        given: channels or names; None to take those of the identification.
-        count: number of channels required.
-    """
+    """The channels of inputs or outputs, given or as kept by the identification as `name`, `count` of them."""
     records = getattr(identified, "records", ()) or getattr(identified, "correlations", ())
     chosen = given if given is not None else getattr(identified, name, getattr(next(iter(records), None), name, None))
     side = name.split("_")[0] + "s"
@@ -137,51 +136,20 @@ def _channels(identified: Any, name: str, given: Sequence[Channel | str] | None,
     return channels
 
 
-@dataclass(frozen=True, eq=False)
-class _Shapes:
-    """Mass-normalised shapes at points, identified modes first, then rigid modes.
-
-    Attributes:
-        values: (n_points, n_modes).
-        points: the points.
-        covariance: (n_modes, n_points, n_points); None where it is unknown.
-    """
-
-    values: np.ndarray
-    points: NamedPoints
-    covariance: np.ndarray | None
-
-
-@dataclass(frozen=True, eq=False)
-class _RigidTerm:
-    """The sum Σ φ_j φ_i of rigid modes.
-
-    Attributes:
-        term: (n_outputs, n_inputs).
-        error: (n_outputs, n_inputs) standard errors.
-        least: norm up to which a part of it is insignificant.
-    """
-
-    term: np.ndarray
-    error: np.ndarray
-    least: float
-
-
 def _shapes_of_residues(
     identified: DrivenModes | FrfModes,
     out: tuple[Channel, ...],
     into: tuple[Channel, ...],
     driving_point: tuple[str, str] | None,
     modal_masses: ArrayLike | None,
-) -> _Shapes:
+) -> Shapes:
     """Shapes at inputs and outputs from residues; an input and an output of the same name are the same point."""
     modes = identified.modes
     residues = _residues(modes, modes.shapes, identified.participation)
     sizes = np.linalg.svd(residues.real, compute_uv=False)
     complexity = np.sqrt(np.maximum(1.0 - sizes[:, 0] ** 2 / np.sum(np.abs(residues) ** 2, axis=(1, 2)), 0.0))
-    participation_error = np.linalg.norm(identified.participation_std, axis=1) / np.linalg.norm(
-        identified.participation, axis=1
-    )
+    norms = (np.linalg.norm(x, axis=1) for x in (identified.participation_std, identified.participation))
+    participation_error = np.divide(*norms)
     _warn_of_complex(modes, complexity, np.hypot(shape_errors(identified), participation_error), "residues")
     for remark in set_up_remarks(identified):
         warnings.warn(remark, stacklevel=3)
@@ -209,22 +177,19 @@ def _shapes_of_residues(
         rigid_term = _rigid_of_direct_term(identified, out, pair, at_out.T @ at_in)
     else:
         rigid_term = _rigid_of_residual_term(identified, out, pair)
-    shape, error = _rigid_modes(rigid_term, pair, len(out), len(into))
-    values = np.vstack([values, shape[:, kept]])
-    covariance = np.concatenate([covariance, [np.diag(row[kept] ** 2) for row in error]]) if len(error) else covariance
-    return _Shapes(values.T, _points([channel for channel, _ in rows.values()]), covariance)
+    if rigid_term is not None:
+        shape, error = _rigid_modes(rigid_term, pair)
+        values = np.vstack([values, shape[:, kept]])
+        covariance = np.concatenate([covariance, [np.diag(row[kept] ** 2) for row in error]])
+    return _points([channel for channel, _ in rows.values()]), values.T, covariance
 
 
 def _rigid_of_direct_term(
     identified: DrivenModes, out: tuple[Channel, ...], pair: tuple[int, int] | None, elastic: np.ndarray
-) -> _RigidTerm | None:
+) -> RigidTerm | None:
     """The residual of the direct term of accelerations, where it is rigid-body motion; None where it is not.
 
-    Args:
-        identified: the modes and the direct term.
-        out: outputs of the rig.
-        pair: indices of an output and the input at its place.
-        elastic: (n_outputs, n_inputs) direct term of the accelerations of the other modes.
+    `pair` is an output and the input at its place, `elastic` (n_outputs, n_inputs) the direct term of the other modes.
     """
     accelerations = np.array([channel.quantity == "acceleration" for channel in out])
     direct, error = identified.feedthrough[accelerations], identified.feedthrough_std[accelerations]
@@ -234,7 +199,7 @@ def _rigid_of_direct_term(
         return None
     only = accelerations.all()
     if only and (pair is None or residual[pair] > 0):
-        return _RigidTerm(residual, error, float(least))
+        return residual, error, float(least)
     share = 100.0 * np.linalg.norm(residual) / np.linalg.norm(direct)
     why = "is not that of modes" if only else "may be rigid-body motion, which outputs of other quantities do not show"
     warnings.warn(
@@ -247,14 +212,8 @@ def _rigid_of_direct_term(
 
 def _rigid_of_residual_term(
     identified: FrfModes, out: tuple[Channel, ...], pair: tuple[int, int] | None
-) -> _RigidTerm | None:
-    """The residual term of modes below the band, where it is rigid-body motion: where it dominates the lowest line.
-
-    Args:
-        identified: the modes and the residual terms.
-        out: outputs of the rig.
-        pair: indices of an output and the input at its place.
-    """
+) -> RigidTerm | None:
+    """The residual term of modes below the band, where it is rigid-body motion: where it dominates the lowest line."""
     order, hz = np.array([MEASURED[channel.quantity][1] for channel in out])[:, None], identified.frequencies_hz
     above = identified.upper_residual[:, :, None] * (2.0 * np.pi * hz) ** order[:, :, None]
     if (share := np.linalg.norm(above) / np.linalg.norm(identified.fitted)) > RIGID_SHARE:
@@ -274,7 +233,7 @@ def _rigid_of_residual_term(
             " is supported, identify from a lower line",
             stacklevel=4,
         )
-        return _RigidTerm(below, error, max(least, RIGID_SHARE * float(np.linalg.norm(below))))
+        return below, error, max(least, RIGID_SHARE * float(np.linalg.norm(below)))
     warnings.warn(
         f"modes below the lowest line, {hz[0]:.4g} Hz, rigid or elastic, make {100.0 * share:.0f} % of the response"
         " there, and are left out of the rig; identify from a lower line",
@@ -283,29 +242,20 @@ def _rigid_of_residual_term(
     return None
 
 
-def _rigid_modes(
-    rigid_term: _RigidTerm | None, pair: tuple[int, int] | None, m: int, q: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Shapes of the rigid modes that the inputs excite, and standard errors, (n_rigid, n_outputs + n_inputs) each.
-
-    Args:
-        rigid_term: their sum Σ φ_j φ_i; None where there is none.
-        pair: indices of an output and the input at its place.
-        m, q: number of outputs and of inputs.
-    """
-    if rigid_term is None:
-        return np.zeros((0, m + q)), np.zeros((0, m + q))
-    u, sizes, v = np.linalg.svd(rigid_term.term, full_matrices=False)
-    count = next(k for k in range(1, sizes.size + 1) if np.linalg.norm(sizes[k:]) <= rigid_term.least)
+def _rigid_modes(rigid_term: RigidTerm, pair: tuple[int, int] | None) -> tuple[np.ndarray, np.ndarray]:
+    """Shapes of the rigid modes that the inputs excite, and standard errors, (n_rigid, n_outputs + n_inputs) each."""
+    term, error, least = rigid_term
+    u, sizes, v = np.linalg.svd(term, full_matrices=False)
+    count = next(k for k in range(1, sizes.size + 1) if np.linalg.norm(sizes[k:]) <= least)
     if count > 1:
         warnings.warn(
             f"the measurement shows {count} rigid modes: responses to these inputs are right, those to masses, springs"
             " or forces elsewhere are not; for these take the rigid modes from the body's mass and inertia",
-            stacklevel=3,
+            stacklevel=4,
         )
     shape = _mass_normalised(np.einsum("jk,k,ki->kji", u, sizes, v)[:count], pair, None)
-    rms = np.sqrt((rigid_term.error**2).mean(axis=1)), np.sqrt((rigid_term.error**2).mean(axis=0))
-    norms = (np.linalg.norm(part, axis=1, keepdims=True) for part in (shape[:, m:], shape[:, :m]))
+    rms = np.sqrt((error**2).mean(axis=1)), np.sqrt((error**2).mean(axis=0))
+    norms = (np.linalg.norm(part, axis=1, keepdims=True) for part in (shape[:, len(term) :], shape[:, : len(term)]))
     return shape, np.hstack([own / norm for own, norm in zip(rms, norms)])
 
 
@@ -317,10 +267,7 @@ def _residues(modes: SampledModes, shapes: np.ndarray, participation: np.ndarray
 def _mass_normalised(residues: np.ndarray, pair: tuple[int, int] | None, masses: np.ndarray | None) -> np.ndarray:
     """Shapes (n_modes, n_outputs + n_inputs) of the nearest real modes, mass-normalised where the scale is known.
 
-    Args:
-        residues: (n_modes, n_outputs, n_inputs) real.
-        pair: indices of an output and the input at its place.
-        masses: (n_modes,) kg, for shapes whose largest entry is 1.
+    From real residues (n_modes, n_outputs, n_inputs), and `masses` (n_modes,) kg of shapes whose largest entry is 1.
     """
     left, sizes, right = np.linalg.svd(residues)
     root = np.sqrt(sizes[:, :1])
@@ -335,13 +282,9 @@ def _mass_normalised(residues: np.ndarray, pair: tuple[int, int] | None, masses:
 
 
 def _propagated(identified: DrivenModes | FrfModes, values: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Covariance (n_modes, n_values, n_values) of a function of the residues, to first order.
+    """Covariance (n_modes, n_values, n_values) of values (n_modes, n_values) of the residues, to first order.
 
     Errors of ω_d are neglected, which are small against those of the shapes.
-
-    Args:
-        identified: the modes with their covariance.
-        values: function of residues (n_modes, n_outputs, n_inputs) that returns (n_modes, n_values).
     """
     modes, errors = identified.modes, identified.vector_covariance
     m, q = modes.shapes.shape[0], identified.participation.shape[1]
@@ -351,32 +294,29 @@ def _propagated(identified: DrivenModes | FrfModes, values: Callable[[np.ndarray
     slopes = []
     for step in np.moveaxis(steps, 2, 0):
         shape, participation_step = step[:, :m].T * largest, step[:, m : m + q] + 1j * step[:, m + q :]
-        both = [
-            values(_residues(modes, modes.shapes + sign * shape, identified.participation + sign * participation_step))
-            for sign in (1.0, -1.0)
-        ]
+        changed = ((modes.shapes + sign * shape, identified.participation + sign * participation_step)
+                   for sign in (1.0, -1.0))  # fmt: skip
+        both = [values(_residues(modes, *each)) for each in changed]
         # the sign of a singular vector is arbitrary
         above, below = (f * np.where(np.sum(f * nominal, axis=1, keepdims=True) < 0, -1.0, 1.0) for f in both)
         slopes.append((above - below) / (2.0 * STEP))
     return np.asarray(np.einsum("kri,krj->rij", slopes, slopes))
 
 
-def _shapes_of_outputs(identified: Any, out: tuple[Channel, ...], modal_masses: ArrayLike | None) -> _Shapes:
+def _shapes_of_outputs(identified: Any, out: tuple[Channel, ...], modal_masses: ArrayLike | None) -> Shapes:
     """Shapes at the outputs from output-only modes, scaled by modal masses."""
     modes = identified.modes
     if modal_masses is None:
         raise ValueError(
             "no input was measured, so the shapes have no scale; give modal_masses= for shapes whose largest entry is 1"
         )
-    known = hasattr(identified, "shape_covariance")
-    _warn_of_complex(modes, far_from_real(modes), shape_errors(identified) if known else np.zeros(1), "shape")
+    covariance = getattr(identified, "shape_covariance", None)
+    error = np.zeros(1) if covariance is None else shape_errors(identified)
+    _warn_of_complex(modes, far_from_real(modes), error, "shape")
     real = normalised_shapes(modes.shapes).real
     largest = real[np.argmax(np.abs(real), axis=0), np.arange(modes.n_modes)]
     root = np.sqrt(_masses(modal_masses, modes.n_modes))
-    relative = getattr(identified, "shape_covariance", None)
-    return _Shapes(
-        real / largest / root, _points(out), None if relative is None else relative / root[:, None, None] ** 2
-    )
+    return _points(out), real / largest / root, None if covariance is None else covariance / root[:, None, None] ** 2
 
 
 def _masses(modal_masses: ArrayLike, n_modes: int) -> np.ndarray:
@@ -387,14 +327,7 @@ def _masses(modal_masses: ArrayLike, n_modes: int) -> np.ndarray:
 
 
 def _warn_of_complex(modes: SampledModes, distance: np.ndarray, error: np.ndarray, what: str) -> None:
-    """Warn of modes that are complex beyond their errors.
-
-    Args:
-        modes: the modes.
-        distance: (n_modes,) relative distance from the nearest real mode.
-        error: (n_modes,) its standard error.
-        what: that is complex, "residues" or "shape".
-    """
+    """Warn of modes whose relative distance (n_modes,) from the nearest real mode is beyond its standard error."""
     for r in are_far(distance, error):
         warnings.warn(
             f"mode {r + 1} at {modes.frequencies_hz[r]:.4g} Hz is complex: the nearest real mode differs from its"
@@ -408,19 +341,14 @@ def _driving_point(
 ) -> tuple[int, int] | None:
     """Indices of an output and the input at its place; None where there is no driving point."""
     if driving_point is not None:
-        input_names = [channel.name for channel in into]
-        output_names = [channel.name for channel in out]
+        input_names, output_names = ([channel.name for channel in side] for side in (into, out))
         if driving_point[0] not in input_names or driving_point[1] not in output_names:
-            raise ValueError(
-                f"driving_point is (input, output), of {', '.join(input_names)} and {', '.join(output_names)}"
-            )
+            names = f"{', '.join(input_names)} and {', '.join(output_names)}"
+            raise ValueError(f"driving_point is (input, output), of {names}")
         return output_names.index(driving_point[1]), input_names.index(driving_point[0])
-    for j, measured in enumerate(out):
-        for i, acting in enumerate(into):
-            same_place = measured.at is not None and measured.at == acting.at
-            if measured.name == acting.name or same_place:
-                return j, i
-    return None
+    pairs = ((j, i) for j, measured in enumerate(out) for i, acting in enumerate(into)
+             if measured.name == acting.name or (measured.at is not None and measured.at == acting.at))  # fmt: skip
+    return next(pairs, None)
 
 
 def _points(channels: Sequence[Channel]) -> NamedPoints:

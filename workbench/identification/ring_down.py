@@ -15,12 +15,7 @@ from workbench.identification.free_decay.assumptions import (
 )
 from workbench.identification.free_decay.ibrahim import stabilise, stable_modes, stacked_delays
 from workbench.identification.free_decay.order import identify_within
-from workbench.identification.free_decay.preparation import (
-    Drift,
-    without_drift,
-    without_polynomial,
-    without_spikes,
-)
+from workbench.identification.free_decay.preparation import Drift, without_drift, without_polynomial, without_spikes
 from workbench.identification.free_decay.refinement import in_coloured_noise, refine, unshaped
 from workbench.identification.signal.clocks import clock_remarks, shape_remarks
 from workbench.identification.signal.data_quality import (
@@ -30,7 +25,7 @@ from workbench.identification.signal.data_quality import (
     of_same_sensors,
 )
 from workbench.identification.signal.harmonics import multiple_of, near_mains
-from workbench.identification.signal.modal_estimates import IdentifiedModes, RefinedEstimates, RefinedModes
+from workbench.identification.signal.modal_estimates import SURE, IdentifiedModes, RefinedEstimates, RefinedModes
 from workbench.identification.signal.projection import forget_transforms, power_of, power_sums, project
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Progress, TimeLimit
 from workbench.records.record import Record, as_records
@@ -53,10 +48,8 @@ class RingDownSettings:
     uncorrelated: float = 3.0  # correlation times √n_samples above which a signal oscillates; white noise has 1
     residual_share: float = 0.1  # largest share of the energy in the bands of the modes that is residual
     most_residual: float = 0.25  # likewise over all frequencies, where the residual is coloured
-    # undamped estimates within so much of the frequency of a mode, relative, and their number, from which on ambient
-    # forces are suspected
-    cluster_band: float = 0.05
-    cluster_size: int = 2
+    cluster_band: float = 0.05  # relative distance from the frequency of a mode to undamped estimates beside it
+    cluster_size: int = 2  # number of these from which on ambient forces are suspected
     second_shape: float = 0.1  # rms share of a mode's motion in all records outside one common shape, to be remarked
     peak_ratio: float = 5.0  # largest ratio of the residual in the bands of the modes to that beside them
     band: int = 6  # least half width of the band of a mode, bins
@@ -64,7 +57,6 @@ class RingDownSettings:
 
 
 RING_DOWN = RingDownSettings()
-SURE = 3.0
 WITHIN_ERROR = "damping no larger than its error"
 
 
@@ -129,14 +121,13 @@ def ring_down(
     time_limit = TimeLimit(seconds, progress)
     records = of_same_sensors(records)
     decays, notes = [], []
+    not_compared = "Frequencies by amplitude are not compared there; leave it out, or cut the record"
     for record in records:
         decay, own_notes = _cut_to_decay(record, start)
         decays.append(decay)
         notes += own_notes if len(records) == 1 else [f"{record.name}: {note}" for note in own_notes]
         check_data_quality(decay)
-        notes += dropout_remark(
-            decay, "Frequencies by amplitude are not compared there; leave it out, or cut the record"
-        )
+        notes += dropout_remark(decay, not_compared)
         _check_undriven(decay)
     try:
         identified, decays, drift_notes = _identify_with_drift(decays, n_modes, time_limit)
@@ -215,7 +206,11 @@ def _identify_with_drift(
     taken = _dominant_drifts(records)  # one per record once drift is removed
     span = max(record.n_samples * record.sample_time for record in records)
     for _ in range(RING_DOWN.drift_rounds):
-        identified = _identify([drift.record for drift in taken] or records, n_modes, time_limit)
+        decays = [drift.record for drift in taken] or records
+        if n_modes is None:
+            identified = identify_within(decays, time_limit)
+        else:
+            identified = _refine_given(stacked_delays(decays, n_modes=n_modes), decays, time_limit)
         before, poles = poles, identified.modes.poles
         poles = poles[np.abs(poles) * span > 2.0 * np.pi]
         drifts = [without_drift(record, poles) for record in records]
@@ -264,12 +259,6 @@ def _settles_within_a_period(drift: Drift) -> bool:
     return drift.time_constant is not None and bool(drift.time_constant * omega < 2.0 * np.pi)
 
 
-def _identify(records: list[Record], n_modes: int | None, time_limit: TimeLimit) -> IdentifiedModes:
-    if n_modes is None:
-        return identify_within(records, time_limit)
-    return _refine_given(stacked_delays(records, n_modes=n_modes), records, time_limit)
-
-
 def _by_stabilisation(records: list[Record], time_limit: TimeLimit) -> IdentifiedModes:
     highest = max(2, min(RING_DOWN.max_modes, min(record.n_samples for record in records) // 8))
     start = stable_modes(stabilise(records, orders=range(2, highest + 1))).modes
@@ -286,13 +275,10 @@ def _refine_given(start: SampledModes, records: list[Record], time_limit: TimeLi
 
 
 def _check_undriven(record: Record) -> None:
-    """Refuse a record of random vibration: it does not decay, and is uncorrelated at long lags.
+    """Refuse a record of random vibration, by a ValueError: it does not decay, and is uncorrelated at long lags.
 
     A free decay of very low damping stays correlated at any lag. Of records of random vibration that are twenty decay
     times long three in four are detected, of a hundred decay times nine in ten.
-
-    Raises:
-        ValueError: such a record.
     """
     n = record.n_samples
     if n // 3 == n // 2:  # too few for any mode, which the identification refuses
@@ -309,11 +295,8 @@ def _check_undriven(record: Record) -> None:
     short, long = (float(np.sqrt((part**2).mean())) for part in lags)
     # White noise has no mode; the selection refuses it.
     oscillates = short > RING_DOWN.uncorrelated / np.sqrt(n)
-    if (
-        oscillates
-        and RING_DOWN.undecayed < energy[1] / max(energy[0], 1e-300) < 1.0 / RING_DOWN.undecayed
-        and long < RING_DOWN.correlated * short
-    ):
+    lasts = RING_DOWN.undecayed < energy[1] / max(energy[0], 1e-300) < 1.0 / RING_DOWN.undecayed
+    if oscillates and lasts and long < RING_DOWN.correlated * short:
         raise ValueError(
             f"record {record.name!r} is no free decay: it is as strong at its end as at its beginning, and not"
             f" correlated over its length. {WAY_OUT}"
@@ -335,11 +318,7 @@ WAY_OUT = (
 
 
 def _check_decays(records: list[Record], refined: RefinedModes) -> None:
-    """Refuse records whose strongest mode has negative damping.
-
-    Raises:
-        ValueError: naming the mode.
-    """
+    """Refuse, by a ValueError, records whose strongest mode has negative damping."""
     strongest = int(np.argmax(_energy(refined, records)))
     zeta = refined.modes.zeta[strongest]
     if zeta < -SURE * refined.zeta_std[strongest]:
@@ -382,10 +361,9 @@ def _large_residual(
 
 def _energy(refined: RefinedModes, records: list[Record]) -> np.ndarray:
     """Energy of each mode over all records, (n_modes,), outputs in units of their noise."""
-    energy = np.zeros(refined.modes.n_modes)
-    for record, amplitudes, noise in zip(records, refined.amplitudes, refined.noise, strict=True):
-        energy += (np.abs(amplitudes / noise[:, None]) ** 2).sum(axis=0) * _envelope_energy(record, refined)
-    return energy
+    each = zip(records, refined.amplitudes, refined.noise, strict=True)
+    squares = ((np.abs(a / noise[:, None]) ** 2).sum(axis=0) * _envelope_energy(r, refined) for r, a, noise in each)
+    return np.asarray(sum(squares))
 
 
 def _envelope_energy(record: Record, refined: RefinedModes) -> np.ndarray:
@@ -397,11 +375,6 @@ def _inconsistent_shapes(refined: RefinedModes, records: list[Record], only: Seq
     """A remark on modes whose shapes differ between records beyond noise: their amplitudes have rank two.
 
     Two modes of the same pole are fitted as one pole, with a different mixture of their shapes in each record.
-
-    Args:
-        refined: the modes.
-        records: the free decays.
-        only: the modes to test, from 0.
     """
     inconsistent = []
     energies = [_envelope_energy(record, refined) for record in records]

@@ -5,8 +5,8 @@ Files of other programs are converted to SI units and to equal time steps, with 
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 from zlib import crc32
@@ -35,37 +35,21 @@ def checksum(description: Mapping[str, Any], signals: Iterable[np.ndarray]) -> i
 
 
 class Signals(NamedTuple):
-    """The signals in a file, before they are a record.
+    """The signals in a file, before they are a record."""
 
-    Attributes:
-        time: (n_samples,) instants, s, where the file has them.
-        signals: (n_samples,) each; a name may begin with its kind, `input:` or `output:`.
-        header: the description as a JSON text.
-        remarks: on assumptions and changes.
-        row_of: the number in the file, from 1 on, of the row of a sample, from 0 on.
-    """
-
-    time: np.ndarray | None
-    signals: dict[str, np.ndarray]
-    header: str | None = None
-    remarks: tuple[str, ...] = ()
-    row_of: Callable[[int], int] = (1).__add__
+    time: np.ndarray | None  # (n_samples,) instants, s, where the file has them
+    signals: dict[str, np.ndarray]  # (n_samples,) each; a name may begin with its kind, `input:` or `output:`
+    header: str | None = None  # the description as a JSON text
+    remarks: tuple[str, ...] = ()  # on assumptions and changes
+    row_of: Callable[[int], int] = (1).__add__  # the number in the file, from 1 on, of the row of a sample, from 0 on
 
 
-@dataclass(frozen=True)
-class Description:
-    """The description of the signals in a file.
+class Description(NamedTuple):
+    """The description of the signals in a file."""
 
-    Attributes:
-        channels: by signal: kind, name, quantity, unit, at, noise_std, as far as given.
-        name: of the record; None where only channels are described.
-        sampling: (start, step), s; None where the file has times alone.
-        input_hold: "zero", "first" or "band-limited".
-    """
-
-    channels: Mapping[str, Mapping[str, Any]]
-    name: str | None = None
-    sampling: tuple[float, float] | None = None
+    channels: Mapping[str, Mapping[str, Any]]  # by signal: kind, name, quantity, unit, at, noise_std, as far as given
+    name: str | None = None  # of the record; None where only channels are described
+    sampling: tuple[float, float] | None = None  # (start, step), s; None where the file has times alone
     input_hold: str = "zero"
 
 
@@ -83,13 +67,8 @@ def record_of(
     Args:
         path: of the file, for messages.
         contents: of the file.
-        sample_rate_hz: where the file has no time.
-        inputs: names of the input signals, where the file does not say.
-        outputs: names of the outputs to read, in their order; all unless given. The others may hold anything.
+        sample_rate_hz, inputs, outputs: as `read_measured` takes them.
         into: the units into which stated units are converted.
-
-    Raises:
-        RecordFileError: the message names the file, channel and row, and the remedy.
     """
     time, signals, header, remarked, row_of = contents
     if not signals:
@@ -118,9 +97,8 @@ def record_of(
         bad = ~np.isfinite(values)
         if bad.any():
             at = int(np.argmax(bad))
-            raise RecordFileError(
-                f"{path}, channel {_name(key)!r}, row {row_of(at)}: {values[at]} is not a number; {FILL}"
-            )
+            where = f"{path}, channel {_name(key)!r}, row {row_of(at)}"
+            raise RecordFileError(f"{where}: {values[at]} is not a number; {FILL}")
     sampling = _sampling(path, contents._replace(signals=signals), described, sample_rate_hz)
     rows = {kind: _rows([signals[key] for key in keys[kind]], [units.get(key) for key in keys[kind]], sampling)
             for kind in KINDS}  # fmt: skip
@@ -129,15 +107,13 @@ def record_of(
         for kind in KINDS
     }
     written: dict[tuple[str, Unit], list[str]] = {}
-    for key, unit in units.items():
-        if key not in signals:
-            continue
-        written.setdefault((split_unit(_name(key))[1], unit), []).append(names[key])
-    remarks = [unit_remark(", ".join(alike), text, unit) for (text, unit), alike in written.items()]
     unknown: dict[str, list[str]] = {}
     for key in signals:
-        if key not in units and key not in described.channels and (text := unknown_unit(_name(key))):
+        if key in units:
+            written.setdefault((split_unit(_name(key))[1], units[key]), []).append(names[key])
+        elif key not in described.channels and (text := unknown_unit(_name(key))):
             unknown.setdefault(text, []).append(names[key])
+    remarks = [unit_remark(", ".join(alike), text, unit) for (text, unit), alike in written.items()]
     remarks += [f"{', '.join(alike)}: as recorded, as {text} is no known unit" for text, alike in unknown.items()]
     try:
         return Record(
@@ -155,8 +131,19 @@ def record_of(
         raise RecordFileError(f"{path}: {error}") from error
 
 
-def _description(path: Path, header: str, signals: Mapping[str, np.ndarray]) -> Description:
+@contextmanager
+def damaged(path: Path, what: str) -> Iterator[None]:
+    """A context in which a fault in the description of the channels or points of a file is a `RecordFileError`."""
     try:
+        yield
+    except RecordFileError:
+        raise
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise RecordFileError(f"{path}: its description of the {what} is damaged: {error}") from error
+
+
+def _description(path: Path, header: str, signals: Mapping[str, np.ndarray]) -> Description:
+    with damaged(path, "channels"):
         table = json.loads(header)
         channels = {f"{c['kind']}:{c['name']}": c for c in table["channels"]}
         if "sample_time" not in table and KEY not in table:
@@ -165,8 +152,6 @@ def _description(path: Path, header: str, signals: Mapping[str, np.ndarray]) -> 
         # descriptions of earlier versions have no hold; their inputs are held ("zero")
         described = Description(channels, str(table["name"]), sampling, table.get("input_hold", "zero"))
         whole = table[KEY] == checksum(table, [signals[key] for key in channels]) and len(signals) == len(channels)
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise RecordFileError(f"{path}: its description of the channels is damaged: {error}") from error
     if not whole:
         raise RecordFileError(
             f"{path} was changed after it was written: its checksum does not match. If that was meant, delete the"
@@ -230,8 +215,7 @@ def _units(path: Path, keys: Iterable[str], into: Units) -> dict[str, Unit]:
     """The units at the end of signal names; none for names that would be equal without them."""
     keys = list(keys)
     for key in keys:
-        both = contradiction(_name(key))
-        if both is not None:
+        if (both := contradiction(_name(key))) is not None:
             raise RecordFileError(
                 f"{path}, channel {_name(key)!r} states two units, {both[0]} and {both[1]}: leave the one that its"
                 " numbers are in"

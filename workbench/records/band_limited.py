@@ -14,11 +14,7 @@ BEYOND = 256  # samples, at most, of the continuation from the end to the start
 
 
 def spectrum_of(signals: Floats) -> Complexes:
-    """DFT (n_signals, size) of each signal with its continuation, size odd.
-
-    Args:
-        signals: (n_signals, n_samples).
-    """
+    """DFT (n_signals, size) of each of the signals (n_signals, n_samples) with its continuation, size odd."""
     n = signals.shape[1]
     if n == 1:
         return np.asarray(signals, complex)
@@ -48,8 +44,7 @@ def finer(signals: Floats, times: int) -> Floats:
     """The signals (n_signals, n_samples) interpolated to `times` as many samples."""
     spectrum = spectrum_of(signals)
     size = spectrum.shape[1]
-    fine = np.zeros((len(signals), size * times), complex)
-    half = (size + 1) // 2
+    fine, half = np.zeros((len(signals), size * times), complex), (size + 1) // 2
     fine[:, :half] = spectrum[:, :half]
     fine[:, fine.shape[1] - (size - half) :] = spectrum[:, half:]
     return np.asarray(times * ifft(fine, axis=1).real[:, : signals.shape[1] * times])
@@ -73,15 +68,8 @@ def derivative_of(signals: Floats) -> Floats:
 def response_of_pole(spectrum: Complexes, pole: complex, n: int) -> tuple[Complexes, Complexes]:
     """z of z' = λ z + u at n samples with z = 0 at the first, and its derivative by λ, (n_signals, n) each.
 
-    The periodic solution is U/(iω - λ) at each line; a free decay makes z zero at the first sample.
-
-    Args:
-        spectrum: by `spectrum_of`.
-        pole: λ times the sample time.
-        n: number of samples.
-
-    Returns:
-        z in units of the sample time, and its derivative in units of the square.
+    The periodic solution is U/(iω - λ) at each line; a free decay makes z zero at the first sample. `pole` is λ times
+    the sample time, z in units of the sample time, and its derivative in units of the square.
     """
     denominator = 1j * angles(spectrum.shape[1]) - pole
     close = np.abs(denominator) < 1e-12  # undamped, on a line

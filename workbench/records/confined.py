@@ -23,7 +23,7 @@ from workbench.records.limits import DEFAULT, ReadLimits, RecordFileError, check
 NAMES = "names"
 REFUSED, NO_MEMORY = 3, 4
 LONGEST_REFUSAL = 10_000  # bytes
-PATIENCE = 5.0  # limit of elapsed time over that of processor time, for a busy machine
+ELAPSED_RATIO = 5.0  # limit of elapsed time over that of processor time, for a busy machine
 OVERHEAD = 2**29  # bytes of address space of the interpreter and its libraries
 # -P keeps the working folder out of the path, so that a file called numpy.py there is not run
 CHILD = (
@@ -35,8 +35,7 @@ ROOT = str(Path(__file__).resolve().parents[2])
 def load_confined(module: str, path: Path, limits: ReadLimits = DEFAULT) -> dict[str, np.ndarray]:
     """The arrays that `load(path, limits)` of a module reads from a file, by name, in order.
 
-    Raises:
-        RecordFileError: the reader refused the file, crashed on it, took too long, or needed too much memory.
+    A reader that refuses the file, crashes on it, takes too long or too much memory is a `RecordFileError`.
     """
     seconds = limits.seconds
     threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # each reserves address space
@@ -47,12 +46,12 @@ def load_confined(module: str, path: Path, limits: ReadLimits = DEFAULT) -> dict
                 stdin=subprocess.DEVNULL,
                 stdout=found,
                 stderr=subprocess.PIPE,
-                timeout=PATIENCE * seconds,
+                timeout=ELAPSED_RATIO * seconds,
                 env=os.environ | threads,
             )
         except subprocess.TimeoutExpired:
             raise RecordFileError(
-                f"{path} is damaged or too large: reading it did not end within {PATIENCE * seconds:.0f} s"
+                f"{path} is damaged or too large: reading it did not end within {ELAPSED_RATIO * seconds:.0f} s"
             ) from None
         found.seek(0)
         if ended.returncode == 0:
@@ -107,10 +106,7 @@ def _confine(limits: ReadLimits) -> None:
         return
     # includes the start of this process and leaves a second for the parent; a short limit applies to the file alone
     used = max(math.floor(limits.seconds) - 1, math.ceil(time.process_time()) + 1)
-    for limit, value in (
-        (resource.RLIMIT_AS, int(limits.memory) + OVERHEAD),
-        (resource.RLIMIT_CORE, 0),
-        (resource.RLIMIT_CPU, used),
-    ):
+    memory = int(limits.memory) + OVERHEAD
+    for limit, value in ((resource.RLIMIT_AS, memory), (resource.RLIMIT_CORE, 0), (resource.RLIMIT_CPU, used)):
         hard = resource.getrlimit(limit)[1]
         resource.setrlimit(limit, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))

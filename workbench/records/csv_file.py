@@ -43,21 +43,15 @@ COUNTERS = ("sample", "samples", "index", "n", "no", "no.", "nr", "nr.", "#", "s
 
 
 def read(path: Path, limits: ReadLimits = DEFAULT) -> Signals:
-    """The signals of a table, with units in brackets after the names.
-
-    Raises:
-        RecordFileError: rows that do not fit the names, or more than the limits allow.
-    """
+    """The signals of a table, with units in brackets after the names."""
     with path.open(encoding=encoding_of(path), newline=None) as file:
         layout = layout_of(path, file)
         blocks = [*_blocks(path, file, layout, limits)] if layout.first[1] else []
     n_columns = len(layout.names) + layout.stamped
     columns = [np.concatenate([block[:, i] for block in blocks]) if blocks else np.empty(0) for i in range(n_columns)]
     del blocks
-    names = [
-        f"{name} [{unit}]" if unit and not split_unit(name)[1] else name
-        for name, unit in zip_longest(layout.names, layout.units)
-    ]
+    names = [f"{name} [{unit}]" if unit and not split_unit(name)[1] else name
+             for name, unit in zip_longest(layout.names, layout.units)]  # fmt: skip
     signals = dict(zip(names, columns[layout.stamped :]))
     contents = Signals(None, signals, layout.header, row_of=partial(_row_in_file, path, layout))
     if layout.stamped:

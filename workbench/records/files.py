@@ -19,19 +19,12 @@ from workbench.records.named_arrays import signals_of
 from workbench.records.record import Record
 from workbench.records.units import SI, Units
 
-FORMATS = {
-    ".csv": csv_file,
-    ".txt": csv_file,
-    ".asc": csv_file,
-    ".dat": csv_file,
-    ".tsv": csv_file,
-    ".lvm": csv_file,
+FORMATS: dict[str, ModuleType] = {
+    **dict.fromkeys((".csv", ".txt", ".asc", ".dat", ".tsv", ".lvm"), csv_file),
     ".npz": npz_file,
     ".mat": mat_file,
-    ".h5": hdf5_file,
-    ".hdf5": hdf5_file,
-    ".uff": uff_file,
-    ".unv": uff_file,
+    **dict.fromkeys((".h5", ".hdf5"), hdf5_file),
+    **dict.fromkeys((".uff", ".unv"), uff_file),
     ".tdms": tdms_file,
     ".wav": wav_file,
 }
@@ -115,7 +108,6 @@ def read_measured(
             arrays = module.arrays(path, limits)
             if not holds_frfs(arrays):
                 contents = signals_of(path, arrays)
-                arrays = {}
     if holds_frfs(arrays):
         if inputs or input_hold is not None:
             raise RecordFileError(f"{path} holds FRFs, which name no inputs; leave them and their hold out")

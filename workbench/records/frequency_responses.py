@@ -54,14 +54,11 @@ class FrequencyResponses(Printed):
                 raise ValueError(f"{self.name}: {kind} names must differ; got {names}")
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
-        rows = [
-            (c.name, c.quantity, c.unit, place_text(c.at), f"{np.abs(values).max():.3g}")
-            for c, values in zip(self.output_channels, self.values, strict=True)
-        ]
+        each = zip(self.output_channels, self.values, strict=True)
+        rows = [(c.name, c.quantity, c.unit, place_text(c.at), f"{np.abs(values).max():.3g}") for c, values in each]
         f = self.frequencies_hz
         pairs = f"{counted(len(self.output_channels), 'output')} by {counted(len(self.references), 'reference')}"
-        span = f"{f.min(initial=np.inf):.4g} to {f.max(initial=0.0):.4g} Hz"
-        line = f"{self.name}: {pairs}, {f.size} lines, {span}"
+        line = f"{self.name}: {pairs}, {f.size} lines, {f.min(initial=np.inf):.4g} to {f.max(initial=0.0):.4g} Hz"
         return line, ("output", "quantity", "unit", "at", "peak"), rows, self.remarks
 
     @property
@@ -71,11 +68,7 @@ class FrequencyResponses(Printed):
     only = Renamed("select_outputs")
 
     def select_outputs(self, outputs: tuple[str, ...]) -> "FrequencyResponses":
-        """The FRFs to some outputs, in that order.
-
-        Raises:
-            ValueError: an unknown output.
-        """
+        """The FRFs to some outputs, in that order; an unknown one is a ValueError."""
         rows = rows_of(self.name, self.output_names, outputs)
         channels = tuple(self.output_channels[row] for row in rows)
         return replace(self, values=self.values[rows], output_channels=channels)
@@ -133,18 +126,11 @@ def impulse_record(
     """
     frf = np.atleast_2d(np.asarray(frf, complex))
     if frf.shape[0] != len(channels) or frf.shape[1] < 3:
-        raise ValueError(
-            f"FRFs must have shape ({len(channels)} outputs, n_frequencies); got {frf.shape}."
-            " Is frequency the last axis?"
-        )
+        wanted = f"({len(channels)} outputs, n_frequencies)"
+        raise ValueError(f"FRFs must have shape {wanted}; got {frf.shape}. Is frequency the last axis?")
     for channel, row in zip(channels, frf, strict=True):
         bad = ~np.isfinite(row)
         if bad.any():
             raise ValueError(f"{name}, channel {channel.name!r}: line {int(np.argmax(bad))} is not a number")
-    n_samples = 2 * (frf.shape[1] - 1)
-    return Record(
-        sample_time=1.0 / sample_rate_hz,
-        outputs=np.fft.irfft(frf, n=n_samples, axis=1) * sample_rate_hz,
-        output_channels=channels,
-        name=name,
-    )
+    outputs = np.fft.irfft(frf, n=2 * (frf.shape[1] - 1), axis=1) * sample_rate_hz
+    return Record(sample_time=1.0 / sample_rate_hz, outputs=outputs, output_channels=channels, name=name)

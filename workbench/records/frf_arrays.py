@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from workbench.records.assembly import legible, unit_remark
+from workbench.records.assembly import damaged, legible, unit_remark
 from workbench.records.frequency_responses import FrequencyResponses
 from workbench.records.limits import RecordFileError
 from workbench.records.record import Channel
@@ -44,9 +44,6 @@ def complex_columns(path: Path, signals: Mapping[str, np.ndarray]) -> dict[str, 
 
     Columns are real and imaginary parts, or magnitude (also in dB) and phase (in rad or degrees). Values are converted
     to SI by a known unit after the name or the part, as in `a [g/N] real`.
-
-    Raises:
-        RecordFileError: a table of frequencies in which a column lacks its other part.
     """
     names = list(signals)
     base, text = split_unit(names[0]) if names else ("", "")
@@ -90,9 +87,8 @@ def complex_columns(path: Path, signals: Mapping[str, np.ndarray]) -> dict[str, 
     lines = signals[names[0]]
     if in_unit and unit is not None:
         lines = lines * (unit.factor / (2.0 * np.pi if unit.quantity == "angular velocity" else 1.0))
-    both = {
-        name: part[2] + 1j * part[3] if 2 in part else part[4] * np.exp(1j * part[5]) for name, part in parts.items()
-    }
+    both = {name: part[2] + 1j * part[3] if 2 in part else part[4] * np.exp(1j * part[5])
+            for name, part in parts.items()}  # fmt: skip
     arrays = {"f" if in_unit else names[0]: lines, **both}
     if not remarks and not any(facts["unit"] for facts in outputs.values()):
         return arrays
@@ -103,11 +99,8 @@ def description(
     outputs: Mapping[str, Mapping[str, str]], references: Sequence[str], remarks: Iterable[str]
 ) -> dict[str, np.ndarray]:
     """Quantity and unit of each output, the names of the inputs, and remarks, as a text beside the arrays."""
-    table = {
-        "outputs": [{"name": name, **facts} for name, facts in outputs.items()],
-        "references": references,
-        "remarks": [*filter(None, remarks)],
-    }
+    facts = [{"name": name, **facts} for name, facts in outputs.items()]
+    table = {"outputs": facts, "references": references, "remarks": [*filter(None, remarks)]}
     return {DESCRIPTION: np.array(json.dumps(table))}
 
 
@@ -122,7 +115,7 @@ def _split_ratio(name: str) -> tuple[str, str, str]:
     return (found[1], top, bottom) if unit_named(top) and unit_named(bottom) else (name, "", "")
 
 
-def frfs_of(path: Path, arrays: Mapping[str, np.ndarray], *, sample_rate_hz: float | None = None) -> FrequencyResponses:
+def frfs_of(path: Path, arrays: Mapping[str, np.ndarray], *, sample_rate_hz: float | None) -> FrequencyResponses:
     """The FRFs in the arrays of a file.
 
     Args:
@@ -130,9 +123,6 @@ def frfs_of(path: Path, arrays: Mapping[str, np.ndarray], *, sample_rate_hz: flo
         arrays: complex ones, with an axis of lines, the others of points (and references); the lines under a name of
             `HERTZ` or `RADIANS`, or a sample rate.
         sample_rate_hz: where the file has neither; the lines are then from zero to the Nyquist frequency.
-
-    Raises:
-        RecordFileError: the message names the file and the array, and the remedy.
     """
     found = {name: _squeezed(v) for name, v in arrays.items() if v.dtype.kind == "c" and v.size > 1}
     lines, assumed = _lines(path, arrays, found, sample_rate_hz)
@@ -161,22 +151,16 @@ def _lines(
     path: Path, arrays: Mapping[str, Any], found: Mapping[str, Any], sample_rate_hz: float | None
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """The lines (n_frequencies,), Hz, and remarks on assumptions."""
-    real = {
-        name: np.ravel(v) for name, v in arrays.items() if v.dtype.kind in "fiu" and max(v.shape, default=1) == v.size
-    }
-    vectors = [
-        (name, values.astype(float) / (2.0 * np.pi if name.lower() in RADIANS else 1.0))
-        for name, values in real.items()
-        if name.lower() in (*HERTZ, *RADIANS) and values.size > 1
-    ]
-    if len(vectors) > 1:
-        names = " and ".join(name for name, _ in vectors)
-        raise RecordFileError(f"{path} holds two arrays of frequencies, {names}; leave one out")
-    if vectors and sample_rate_hz is not None:
-        raise RecordFileError(f"{path} holds its frequencies, {vectors[0][0]!r}; leave the sample rate out")
-    if vectors:
-        return vectors[0][1], ()
-    return _lines_of_rate(path, real, found, sample_rate_hz)
+    real = {name: np.ravel(v) for name, v in arrays.items()
+            if v.dtype.kind in "fiu" and max(v.shape, default=1) == v.size}  # fmt: skip
+    names = [name for name, values in real.items() if name.lower() in (*HERTZ, *RADIANS) and values.size > 1]
+    if not names:
+        return _lines_of_rate(path, real, found, sample_rate_hz)
+    if len(names) > 1:
+        raise RecordFileError(f"{path} holds two arrays of frequencies, {' and '.join(names)}; leave one out")
+    if sample_rate_hz is not None:
+        raise RecordFileError(f"{path} holds its frequencies, {names[0]!r}; leave the sample rate out")
+    return real[names[0]].astype(float) / (2.0 * np.pi if names[0].lower() in RADIANS else 1.0), ()
 
 
 def _lines_of_rate(
@@ -184,11 +168,7 @@ def _lines_of_rate(
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """The lines (n_frequencies,), Hz, of a DFT whose sample rate is given or in the file, and the assumption made.
 
-    Args:
-        path: of the file.
-        real: its vectors and single values by name, the sample rate or the number of samples perhaps among them.
-        found: the FRFs.
-        sample_rate_hz: as given.
+    The sample rate or the number of samples may be among `real`, the vectors and single values of the file.
     """
     scalars = {name.lower(): float(values[0]) for name, values in real.items() if values.size == 1}
     longest = max(max(values.shape) for values in found.values())
@@ -199,8 +179,8 @@ def _lines_of_rate(
     if rate is None:
         name = next(iter(found))
         raise RecordFileError(
-            f"{path}, {name!r} is complex: FRFs? The file has no lines; add them as an array"
-            " 'frequency_hz', or give the sample rate if they go from zero to half of it"
+            f"{path}, {name!r} is complex: FRFs? The file has no lines; add them as an array 'frequency_hz', or give"
+            " the sample rate if they go from zero to half of it"
         )
     if not 0 < rate < np.inf:
         raise RecordFileError(f"{path}: the sample rate must be positive; got {rate:g}")
@@ -246,16 +226,12 @@ def _points(
 ) -> tuple[tuple[Channel, ...], tuple[str, ...], tuple[str, ...]]:
     """Channels and references, named by the file or numbered, and the remarks of reading."""
     if DESCRIPTION in arrays:
-        try:
+        with damaged(path, "points"):
             described = json.loads(str(arrays[DESCRIPTION]))
             outputs = [[str(c[fact]) for fact in ("name", "quantity", "unit")] for c in described["outputs"]]
             channels = tuple(Channel(legible(path, name), quantity, unit) for name, quantity, unit in outputs)
             references, remarks = (map(str, described[key]) for key in ("references", "remarks"))
             return channels, tuple(legible(path, name) for name in references), tuple(remarks)
-        except RecordFileError:
-            raise
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise RecordFileError(f"{path}: its description of the points is damaged: {error}") from error
     at = [np.ravel(arrays[name]) for name in PLACES if name in arrays]
     if at and at[0].shape != (len(names),):
         raise RecordFileError(f"{path} gives {at[0].size} places of {len(names)} points; give each its own")

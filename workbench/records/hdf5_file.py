@@ -26,12 +26,11 @@ def load(path: Path, limits: ReadLimits) -> dict[str, np.ndarray]:
     """The numbers and texts in the file and its header, sizes checked first; to be called in a separate process."""
     with h5py.File(path, "r") as file:
         held = _held(file)
-        found = {name: each for name, each in held.items() if isinstance(each, h5py.Dataset) and _is_read(each)}
+        found = {name: each for name, each in held.items() if _is_read(each)}
         structs = {name: _held(each) for name, each in held.items() if each.attrs.get("MATLAB_class") == b"struct"
                    and isinstance(each, h5py.Group)}  # fmt: skip
         if structs and not any(_is_numeric(each) and (each.size or 0) > 1 for each in found.values()):
-            fields = {name: each for name, each in next(iter(structs.values())).items()
-                      if isinstance(each, h5py.Dataset) and _is_read(each)}  # fmt: skip
+            fields = {name: each for name, each in next(iter(structs.values())).items() if _is_read(each)}
             check_struct(path, structs, fields)
             found = fields | found
         check_counts(path, len(found), sum(map(_numbers, found.values())), limits)
@@ -87,10 +86,10 @@ def _is_text(dataset: Any) -> bool:
     return h5py.check_string_dtype(dataset.dtype) is not None
 
 
-def _is_read(dataset: Any) -> bool:
-    """Whether a dataset is text, or numbers that are not MATLAB text or cells."""
-    is_matlab_text = dataset.attrs.get("MATLAB_class") in (b"char", b"cell")
-    return _is_text(dataset) or (_is_numeric(dataset) and not is_matlab_text)
+def _is_read(held: Any) -> bool:
+    """Whether a member of a file is a dataset of text, or of numbers that are not MATLAB text or cells."""
+    is_matlab_text = held.attrs.get("MATLAB_class") in (b"char", b"cell")
+    return isinstance(held, h5py.Dataset) and (_is_text(held) or (_is_numeric(held) and not is_matlab_text))
 
 
 def _numbers(dataset: Any) -> int:

@@ -22,7 +22,7 @@ SLACK = 2.0**-23  # of the record's length: instants that were in single precisi
 MOST_SLACK = 0.1  # of the rounding
 FEWEST_ODD = 3  # least number of unequal steps if instants were rounded
 MOST_DIGITS = 15  # of a rate
-TELLING, USELESS = 1e-4, 1e-2  # relative widths of the allowed rates that are remarked, and refused
+REMARKED, REFUSED = 1e-4, 1e-2  # relative widths of the allowed rates that are remarked, and refused
 LATEST = 1e11  # s since 1970, in the year 5138: larger numbers count a smaller unit
 # The signals' predictor that tells whether the instants or the samples are uneven.
 ORDER, LONGEST_PART, MOST_SIGNALS = 32, 2**15, 8
@@ -30,18 +30,12 @@ ORDER, LONGEST_PART, MOST_SIGNALS = 32, 2**15, 8
 
 @dataclass(frozen=True, eq=False)
 class Sampling:
-    """The sampling of a record.
+    """The sampling of a record, at equal steps."""
 
-    Attributes:
-        start, step: of equal steps, s.
-        times: (n_samples,) unequal instants, from which the signals are to be resampled; else None.
-        remarks: on assumptions and changes.
-    """
-
-    start: float
-    step: float
-    times: np.ndarray | None = None
-    remarks: tuple[str, ...] = ()
+    start: float  # s
+    step: float  # s
+    times: np.ndarray | None = None  # (n_samples,) unequal instants, from which the signals are to be resampled
+    remarks: tuple[str, ...] = ()  # on assumptions and changes
 
 
 def in_seconds(name: str, values: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -60,11 +54,7 @@ def in_seconds(name: str, values: np.ndarray) -> tuple[np.ndarray, tuple[str, ..
 
 
 def even_sampling(
-    path: Path,
-    time: np.ndarray,
-    signals: Sequence[np.ndarray],
-    stated_hz: float | None,
-    row_of: Callable[[int], int],
+    path: Path, time: np.ndarray, signals: Sequence[np.ndarray], stated_hz: float | None, row_of: Callable[[int], int]
 ) -> Sampling:
     """Start and step of sample instants, which may be rounded, or jitter, or be uneven.
 
@@ -154,15 +144,13 @@ def _rounded(path: Path, time: np.ndarray, steps: np.ndarray, stated_hz: float |
     width = high / low - 1.0
     span = f"rates from {low:.7g} to {high:.7g} Hz" if high < np.inf else f"any rate above {low:.7g} Hz"
     allowed = f"times rounded to {rounding:g} s allow {span}"
-    if width > USELESS and stated is None:
+    if width > REFUSED and stated is None:
         raise RecordFileError(f"{path}: {allowed}, which is too uncertain; state the rate by sample_rate_hz")
     rate = _roundest(low, high) if stated is None else stated
     remark = f"{allowed}: taken as evenly sampled at {rate:.7g} Hz"
-    if width > TELLING and stated is None:
-        remark += (
-            f"; frequencies and rates of decay are uncertain by as much, {100 * width:.2g} %: state the rate by"
-            " `sample_rate_hz` if you know it"
-        )
+    if width > REMARKED and stated is None:
+        remark += f"; frequencies and rates of decay are uncertain by as much, {100 * width:.2g} %:"
+        remark += " state the rate by `sample_rate_hz` if you know it"
     residual = time - np.arange(time.size) / rate
     return Sampling(float(residual.max() + residual.min()) / 2, 1.0 / rate, remarks=(remark,))
 

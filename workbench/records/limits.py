@@ -11,11 +11,11 @@ COPIES = 4  # of a record, at most, in memory while it is read
 BYTES_PER_NUMBER = 8
 MOST_BYTES = 2**30
 MOST_CHANNELS = 10_000
-TELLING = 0.1  # of the time limit, after which the remaining time is extrapolated
+EXTRAPOLATED = 0.1  # of the time limit, after which the remaining time is extrapolated
 SPARE = 0.3  # tolerance of extrapolations, as rows grow longer with the digits of their times
 LONGEST = 200  # characters of a reader's message that is passed on
 # of a reader that did not see what is wrong; their messages speak of its code, not of the file
-STUMBLES = (ArithmeticError, AssertionError, AttributeError, LookupError, NameError, TypeError)
+READER_FAULTS = (ArithmeticError, AssertionError, AttributeError, LookupError, NameError, TypeError)
 
 
 class RecordFileError(ValueError):
@@ -26,7 +26,7 @@ def unreadable(path: Path, error: Exception) -> RecordFileError:
     """The error for a reader's exception: the first line of its message, shortened, without control characters."""
     text = next(iter(str(error).splitlines()), "") or type(error).__name__
     shown = "".join(c if c.isprintable() else "?" for c in text[:LONGEST]) + ("..." if len(text) > LONGEST else "")
-    if isinstance(error, STUMBLES):
+    if isinstance(error, READER_FAULTS):
         shown = f"{type(error).__name__} in its reader ({shown}): it is damaged, or of a kind that is not read"
     return RecordFileError(f"{path} cannot be read as {path.suffix[1:].upper()}: {shown}")
 
@@ -81,13 +81,9 @@ class Deadline:
         self._begun = time.process_time()
 
     def check(self, share: float = 1.0) -> None:
-        """Refuse, by a `RecordFileError`, to continue where the time limit is or, by extrapolation, will be exceeded.
-
-        Args:
-            share: of the file, read so far.
-        """
+        """Refuse, by a `RecordFileError`, to go on beyond the limit, or where the share read so far foretells that."""
         spent = time.process_time() - self._begun
-        extrapolates = spent > TELLING * self._seconds
+        extrapolates = spent > EXTRAPOLATED * self._seconds
         if spent > self._seconds or (extrapolates and spent / share > self._seconds * _allowed(share)):
             raise RecordFileError(
                 f"{self._path} takes more than {self._seconds:g} s to read: cut the record, take fewer channels, or"
@@ -117,12 +113,7 @@ def check_file(path: Path) -> None:
 def check_counts(path: Path, n_channels: int, n_numbers: int, limits: ReadLimits = DEFAULT, share: float = 1.0) -> None:
     """Refuse, by a `RecordFileError`, more channels than `MOST_CHANNELS` or more numbers than the memory allows.
 
-    Args:
-        path: of the file.
-        n_channels: in the whole file.
-        n_numbers: in a share of the file.
-        limits: see `ReadLimits`.
-        share: of the file; the rest is extrapolated.
+    The numbers are those of a share of the file, from which the rest is extrapolated.
     """
     if n_channels > MOST_CHANNELS:
         raise RecordFileError(f"{path} holds {n_channels} channels; at most {MOST_CHANNELS} are read")

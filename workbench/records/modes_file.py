@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,13 +14,11 @@ from workbench.records.limits import RecordFileError, check_file, reading
 from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes
 
-FORMATS = {
-    ".uff": uff_modes,
-    ".unv": uff_modes,
+FORMATS: dict[str, ModuleType] = {
+    **dict.fromkeys((".uff", ".unv"), uff_modes),
     ".npz": npz_file,
     ".mat": mat_file,
-    ".h5": hdf5_file,
-    ".hdf5": hdf5_file,
+    **dict.fromkeys((".h5", ".hdf5"), hdf5_file),
 }
 SCALES = ("mass_matrix", "modal_mass")  # arrays that determine the scale of the shapes
 ORTHOGONAL = 1e-3  # of unit modal mass: tolerated rounding of products of different modes
@@ -78,17 +77,17 @@ def _modes_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Modes:
             raise RecordFileError(
                 f"{path}: an array {name!r} is not known; name it {' or '.join(likely)} if it is that, or leave it out"
             )
-    if "shapes" not in arrays or not {"frequencies_hz", "omega"} & set(arrays):
+    stated = {"frequencies_hz", "omega"} & set(arrays)
+    if "shapes" not in arrays or not stated:
         raise RecordFileError(
             f"{path} needs `shapes` (n_points, n_modes) and `frequencies_hz` or `omega`; it holds"
             f" {', '.join(sorted(arrays)) or 'nothing'}"
         )
-    if {"frequencies_hz", "omega"} <= set(arrays):
+    if len(stated) == 2:
         raise RecordFileError(f"{path} holds both `frequencies_hz` and `omega`; leave one of them out")
-    given = "omega" if "omega" in arrays else "frequencies_hz"
+    (given,) = stated
     frequencies = np.ravel(arrays[given]).astype(float)
-    if not (np.isfinite(frequencies) & (frequencies >= 0)).all():
-        r = int(np.argmin(np.isfinite(frequencies) & (frequencies >= 0)))
+    if (r := _first(~np.isfinite(frequencies) | (frequencies < 0))) is not None:
         raise RecordFileError(
             f"{path}: {given} must be finite and not negative; of mode {r + 1} it is {frequencies[r]:.6g};"
             " leave out modes that are unstable"
@@ -106,8 +105,7 @@ def _modes_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Modes:
         i, r = np.argwhere(~np.isfinite(shapes))[0]
         raise RecordFileError(f"{path}: shapes must be finite; of mode {r + 1} row {i + 1} is {shapes[i, r]}")
     zeta = _one_a_mode(path, "damping_ratios", arrays.get("damping_ratios", 0.0), omega.size)
-    if not (np.abs(zeta) < 1).all():
-        r = int(np.argmin(np.abs(zeta) < 1))
+    if (r := _first(~(np.abs(zeta) < 1))) is not None:
         raise RecordFileError(
             f"{path}: damping_ratios must be finite and below 1; of mode {r + 1} it is {zeta[r]:.6g}: give ratios, not"
             " per cent"
@@ -160,16 +158,20 @@ def _scaled(path: Path, shapes: np.ndarray, arrays: Mapping[str, np.ndarray]) ->
         masses = _one_a_mode(path, "modal_mass", arrays["modal_mass"], n_modes)
     else:
         return shapes
-    if (masses < 0).any():
-        r = int(np.argmax(masses < 0))
-        raise RecordFileError(f"{path}: modal_mass must be positive, kg; of mode {r + 1} it is {masses[r]:.6g}")
-    if not (masses > 0).all():
-        r = int(np.argmin(masses > 0))
+    if (negative := _first(masses < 0)) is not None:
+        which = f"of mode {negative + 1} it is {masses[negative]:.6g}"
+        raise RecordFileError(f"{path}: modal_mass must be positive, kg; {which}")
+    if (unstated := _first(~(masses > 0))) is not None:
         raise RecordFileError(
-            f"{path} states no modal mass of mode {r + 1}, so its shape has no scale; give"
+            f"{path} states no modal mass of mode {unstated + 1}, so its shape has no scale; give"
             " read_modes(path, modal_mass=...), 1.0 where the shapes are mass-normalised"
         )
     return shapes / np.sqrt(masses)
+
+
+def _first(wrong: np.ndarray) -> int | None:
+    """The first mode of which something is wrong, from 0."""
+    return int(np.argmax(wrong)) if wrong.any() else None
 
 
 def _one_a_mode(path: Path, name: str, values: ArrayLike, n_modes: int) -> Floats:
@@ -183,16 +185,13 @@ def _one_a_mode(path: Path, name: str, values: ArrayLike, n_modes: int) -> Float
 
 
 def _points(path: Path, n: int, arrays: Mapping[str, np.ndarray]) -> NamedPoints:
-    text = {
-        k: tuple(str(v).strip() for v in np.ravel(arrays[k])) for k in ("names", "nodes", "directions") if k in arrays
-    }
-    nodes, directions = text.get("nodes", ()), text.get("directions", ())
-    if "names" in text:
-        names = text["names"]
-    elif nodes:
+    names, nodes, directions = (
+        tuple(str(v).strip() for v in np.ravel(arrays.get(key, ()))) for key in ("names", "nodes", "directions")
+    )
+    if "names" not in arrays and nodes:
         apart = "." if any(node[-1:].isalpha() for node in nodes) else ""
         names = tuple(node + apart + d for node, d in zip(nodes, directions or ("",) * len(nodes)))
-    else:
+    elif "names" not in arrays:
         names = tuple(f"{i + 1}" for i in range(n))
     if len(names) != n:
         raise RecordFileError(f"{path}: {n} rows of shapes need as many points; it names {len(names)}")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from workbench.records.assembly import Signals
+from workbench.records.assembly import Signals, damaged
 from workbench.records.frf_arrays import SURE_RATES
 from workbench.records.instants import in_seconds
 from workbench.records.limits import RecordFileError, check_counts
@@ -22,13 +22,7 @@ def numbered(signals: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def check_struct(path: Path, structs: Mapping[str, Collection[str]], read: Collection[str]) -> None:
-    """Refuse, by a `RecordFileError`, MATLAB structs except a single one whose fields are signals.
-
-    Args:
-        path: of the file.
-        structs: fields, by struct.
-        read: fields of the single struct that are signals.
-    """
+    """Refuse, by a `RecordFileError`, MATLAB structs, given by their fields, except a single one of signals, `read`."""
     if len(structs) == 1 and read:
         return
     listed = "; ".join(f"{name} with {', '.join(fields) or 'no fields'}" for name, fields in structs.items())
@@ -43,9 +37,6 @@ def signals_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Signals:
 
     An array of two axes, one as long as the other signals, becomes several signals, `NAME 1` and so on. A single value
     named `fs`, or another of `SURE_RATES`, gives the time where no array does.
-
-    Raises:
-        RecordFileError: an array that is not rows of samples, two arrays of times, or numbered channels without header.
     """
     header = str(np.ravel(arrays[HEADER])[0]) if HEADER in arrays and np.size(arrays[HEADER]) else None
     time: np.ndarray | None = None
@@ -59,8 +50,7 @@ def signals_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Signals:
         if values.dtype.kind not in "fiub" or values.size == 1:
             continue
         if values.ndim > 1 and 1 not in values.shape:
-            for i, each in enumerate(_rows(path, name, values, lengths), 1):
-                signals[f"{name} {i}"] = each
+            signals |= {f"{name} {i}": each for i, each in enumerate(_rows(path, name, values, lengths), 1)}
             continue
         row = values.reshape(-1).astype(float, copy=False)
         if time_factor(name) is None:
@@ -70,18 +60,17 @@ def signals_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Signals:
         else:
             raise RecordFileError(f"{path} holds two arrays of times, {first} and {name}; leave one out")
     if time is None and signals:
-        rates = [
-            float(v.item())
-            for n, v in arrays.items()
-            if n.lower() in SURE_RATES and v.size == 1 and v.dtype.kind in "fiu"
-        ]
+        rates = [float(v.item()) for n, v in arrays.items()
+                 if n.lower() in SURE_RATES and v.size == 1 and v.dtype.kind in "fiu"]  # fmt: skip
         if len(rates) == 1 and 0.0 < rates[0] < np.inf:
             time = np.arange(max(row.size for row in signals.values())) / rates[0]
     if any(name.startswith(NUMBERED) for name in signals):
         counted = [f"{NUMBERED}{i}" for i in range(len(signals))]
         if header is None or sorted(signals) != sorted(counted):
             raise RecordFileError(f"{path} is damaged: its channels and their description do not belong together")
-        signals = dict(zip(_keys(path, header), (signals[name] for name in counted)))
+        with damaged(path, "channels"):
+            keys = [f"{c['kind']}:{c['name']}" for c in json.loads(header)["channels"]]
+        signals = dict(zip(keys, (signals[name] for name in counted)))
     return Signals(time, signals, header, () if header else remarks)
 
 
@@ -95,10 +84,3 @@ def _rows(path: Path, name: str, values: np.ndarray, lengths: set[int]) -> np.nd
         )
     check_counts(path, values.shape[1 - along[0]], 0)
     return np.asarray(np.moveaxis(values, along[0], 1), float)
-
-
-def _keys(path: Path, header: str) -> list[str]:
-    try:
-        return [f"{c['kind']}:{c['name']}" for c in json.loads(header)["channels"]]
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise RecordFileError(f"{path}: its description of the channels is damaged: {error}") from error

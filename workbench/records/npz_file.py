@@ -18,11 +18,7 @@ LONGEST_TEXT = 2**22  # characters
 
 
 def arrays(path: Path, limits: ReadLimits = DEFAULT) -> dict[str, np.ndarray]:
-    """The arrays of an archive, read after a check of the sizes that their headers declare.
-
-    Raises:
-        RecordFileError: no archive, a damaged one, a pickle, or more than the limits allow.
-    """
+    """The arrays of an archive, read after a check of the sizes that their headers declare; never a pickle."""
     deadline = Deadline(path, limits)
     with reading(path), zipfile.ZipFile(path) as archive:
         members = archive.infolist()

@@ -113,10 +113,8 @@ class Record(Printed):
                 f"record {self.name!r}: inputs and outputs must have as many samples, time last; got"
                 f" {inputs.shape[1]} and {outputs.shape[1]}"
             )
-        for kind, values, channels in (
-            ("input", inputs, self.input_channels),
-            ("output", outputs, self.output_channels),
-        ):
+        sides = ("input", inputs, self.input_channels), ("output", outputs, self.output_channels)
+        for kind, values, channels in sides:
             if values.shape[0] != len(channels):
                 raise ValueError(
                     f"record {self.name!r}: {kind}s must have shape ({len(channels)} channels, n_samples);"
@@ -202,15 +200,12 @@ class Record(Printed):
         inside = np.flatnonzero((time >= low) & (time <= high))
         if inside.size == 0:
             wanted = [f"{word} {at:g} s" for word, at in (("from", start), ("to", stop)) if at is not None]
-            raise ValueError(
-                f"record {self.name!r} runs from {time[0]:g} to {time[-1]:g} s: it has no sample {' '.join(wanted)}"
-            )
+            span = f"from {time[0]:g} to {time[-1]:g} s"
+            raise ValueError(f"record {self.name!r} runs {span}: it has no sample {' '.join(wanted)}")
         if inside.size == self.n_samples:
             return self
-        kept = slice(inside[0], inside[-1] + 1)
-        return replace(
-            self, outputs=self.outputs[:, kept], inputs=self.inputs[:, kept], start_time=float(time[inside[0]])
-        )
+        kept, first = slice(inside[0], inside[-1] + 1), float(time[inside[0]])
+        return replace(self, outputs=self.outputs[:, kept], inputs=self.inputs[:, kept], start_time=first)
 
     only = Renamed("select_outputs")
 
@@ -224,18 +219,14 @@ class Record(Printed):
     def with_inputs(self, names: Sequence[str]) -> "Record":
         """The record with the named signals as inputs and all others as outputs, each in the order they had.
 
-        Without others, they are the outputs too.
-
-        Raises:
-            ValueError: an unknown name.
+        Without others, they are the outputs too. An unknown name is a ValueError.
         """
         channels, rows = (*self.input_channels, *self.output_channels), (*self.inputs, *self.outputs)
         there = [channel.name for channel in channels]
         for name in names:
             if name not in there:
-                raise ValueError(
-                    f"record {self.name!r} has no signal {name!r} to take as an input; it has {', '.join(there)}"
-                )
+                needed = f"no signal {name!r} to take as an input"
+                raise ValueError(f"record {self.name!r} has {needed}; it has {', '.join(there)}")
         into = [i for i, name in enumerate(there) if name in names]
         out = [i for i in range(len(there)) if i not in into] or into
         return replace(
@@ -290,11 +281,7 @@ class Record(Printed):
 
 
 def rows_of(owner: str, outputs: Sequence[str], names: Sequence[str]) -> list[int]:
-    """The rows of named outputs, in the order of the names; `owner` has the outputs, in words.
-
-    Raises:
-        ValueError: an unknown name.
-    """
+    """The rows of named outputs, in the order of the names; a name that `owner` (in words) does not have is refused."""
     row_of = {name: row for row, name in enumerate(outputs)}
     for name in names:
         if name not in row_of:

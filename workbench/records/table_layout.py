@@ -43,35 +43,20 @@ LABVIEW_WITHOUT_X = re.compile(r"X_Columns\W+No\W*", re.IGNORECASE)  # the line 
 
 @dataclass(frozen=True)
 class Layout:
-    """The layout of a table.
+    """The layout of a table."""
 
-    Attributes:
-        names: one per column of numbers.
-        units: one per column of numbers, as written; empty where none are stated.
-        delimiter: between fields; a blank for any run of white space.
-        n_front: number of leading columns that are not numbers.
-        stamped: whether these are a date, a time of day, or both; else they are empty, as in LabVIEW files.
-        trailing: whether each row ends with a delimiter.
-        comments: whether texts may follow the numbers.
-        header: the description written by this program, as a JSON text.
-        first: (number of the row in the file, text) of the first row of numbers; (0, "") where there is none.
-        sampling: (start, step), s, where the header states them.
-        decimal_comma: whether the decimal mark is a comma; None until a number has a mark.
-        has_complex: whether numbers as 1.2+3.4i are two columns, of real and imaginary parts.
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    delimiter: str
-    n_front: int = 0
-    stamped: bool = False
-    trailing: bool = False
-    comments: bool = False
-    header: str | None = None
-    first: tuple[int, str] = (0, "")
-    sampling: tuple[float, float] | None = None
-    decimal_comma: bool | None = None
-    has_complex: bool = False
+    names: tuple[str, ...]  # one per column of numbers
+    units: tuple[str, ...]  # one per column of numbers, as written; empty where none are stated
+    delimiter: str  # between fields; a blank for any run of white space
+    n_front: int = 0  # number of leading columns that are not numbers
+    stamped: bool = False  # whether these are a date, a time of day, or both; else they are empty, as in LabVIEW files
+    trailing: bool = False  # whether each row ends with a delimiter
+    comments: bool = False  # whether texts may follow the numbers
+    header: str | None = None  # the description written by this program, as a JSON text
+    first: tuple[int, str] = (0, "")  # number in the file, and text, of the first row of numbers
+    sampling: tuple[float, float] | None = None  # (start, step), s, where the header states them
+    decimal_comma: bool | None = None  # whether the decimal mark is a comma; None until a number has a mark
+    has_complex: bool = False  # whether numbers as 1.2+3.4i are two columns, of real and imaginary parts
 
     def parted(self, line: str) -> str:
         """A row with the real and imaginary parts of complex numbers in fields of their own."""
@@ -86,18 +71,15 @@ class Layout:
 def decided(path: Path, layout: Layout, block: str, lines: Sequence[str]) -> Layout:
     """The layout with the decimal mark of the first of these rows that has one; unchanged where none has.
 
-    Raises:
-        RecordFileError: marks that may be thousands separators, as in a column of 999 and 1,500.
+    Marks that may be thousands separators, as in a column of 999 and 1,500, are refused.
     """
     signs = '."' if layout.delimiter == "," else ".,"  # without these there are whole numbers alone
     if layout.decimal_comma is not None or not any(sign in block for sign in signs):
         return layout
-    fields = (field.strip() for line in lines for field in layout.fields(line))
-    mark = next((found[0] for found in map(MARKS.search, fields) if found), None)
+    mark = next((found[0] for line in lines for found in map(MARKS.search, layout.fields(line)) if found), None)
     if mark is None:
         return layout
-    fields = (field.strip() for line in lines for field in layout.fields(line))
-    if all(map(THOUSANDS.fullmatch, (field for field in fields if mark in field))):
+    if all(THOUSANDS.fullmatch(field.strip()) for line in lines for field in layout.fields(line) if mark in field):
         for name, column in zip(layout.names, zip(*map(layout.fields, lines))):
             marked = [field for field in column if mark in field]
             if marked and any(map(SMALL.fullmatch, column)):
@@ -125,11 +107,7 @@ def encoding_of(path: Path) -> str:
 
 
 def layout_of(path: Path, file: TextIOBase) -> Layout:
-    """The layout of a table, recognised from the file down to its first row of numbers.
-
-    Raises:
-        RecordFileError: no names before the numbers, a row below the names with something else, or no table.
-    """
+    """The layout of a table, recognised from the file down to its first row of numbers."""
     lines: list[tuple[int, str]] = []  # of text, with their rows
     header, comment, characters = None, "", 0
     without_x = comments = False
@@ -188,11 +166,7 @@ def check_length(path: Path, number: int, line: str) -> None:
 
 
 def check_row(path: Path, layout: Layout, number: int, line: str) -> list[float]:
-    """The numbers of a row.
-
-    Raises:
-        RecordFileError: too many or too few fields, or a field that is not a number.
-    """
+    """The numbers of a row; one with too many or too few fields, or a field that is not a number, is refused."""
     if LABVIEW_SEGMENT.fullmatch(line):
         raise RecordFileError(
             f"{path}, row {number}: the header of a further segment; write the LabVIEW file with 'One header only', or"
@@ -229,7 +203,9 @@ def _with_names(path: Path, lines: Sequence[tuple[int, str]], comment: str, foun
             rows.append((number, line, [field.strip() for field in fields[found.n_front :]]))
     titles = [row for row in rows if not any(_is_number(f, None) or MOMENT.fullmatch(f) for f in row[2])]
     if not titles or (len(titles) == 1 and _are_units(titles[0][2], set())):
-        titles = [row for row in rows if row in titles or _are_numbered(row[2])]
+        # channels may be named by their numbers, as in `Time, 1, 2`
+        titles = [row for row in rows if row in titles
+                  or (time_factor(row[2][0]) is not None and all(map(str.isdecimal, row[2][1:])))]  # fmt: skip
     channel_units, sampling = _labview_header(path, [_fields(line, found.delimiter, False) for _, line in lines])
     if not titles:  # as numpy's savetxt: behind a comment
         names = _fields(comment, found.delimiter, found.trailing)[found.n_front :]
@@ -273,12 +249,8 @@ def _with_names(path: Path, lines: Sequence[tuple[int, str]], comment: str, foun
 def _labview_header(path: Path, lines: Sequence[Sequence[str]]) -> tuple[tuple[str, ...], tuple[float, float] | None]:
     """Units of the channels and sampling in the header of a LabVIEW file, from the lines above the numbers (in fields).
 
-    Returns:
-        Units, one per channel as written, none for files of other programs; and (start, step), s, where the instants
-        are not written.
-
-    Raises:
-        RecordFileError: spectra, or channels without instants that differ in start or rate.
+    Units are one per channel as written, none for files of other programs; sampling is (start, step), s, where the
+    instants are not written.
     """
     rows = {fields[0].strip(): [text.strip() for text in fields[1:]] for fields in lines if fields}
     if LABVIEW_END not in rows:
@@ -315,19 +287,12 @@ def _with_parts(layout: Layout) -> Layout:
 def _names_and_units(titles: Sequence[list[str]]) -> tuple[int, int | None]:
     """Indices of the header lines of names and of units (or None); for names a line that names a time is preferred."""
     timed = [{j for j, field in enumerate(fields) if time_factor(field) is not None} for fields in titles]
-    units = None
-    for i in reversed(range(len(titles))):
-        if len(titles) > 1 and _are_units(titles[i], set().union(*timed[:i], *timed[i + 1 :])):
-            units = i
-            break
+    from_below = reversed(range(len(titles))) if len(titles) > 1 else ()
+    are_units = (i for i in from_below if _are_units(titles[i], set().union(*timed[:i], *timed[i + 1 :])))
+    units = next(are_units, None)
     others = [i for i in range(len(titles)) if i != units]
     nearest = others[-1] if units in (None, 0) else units - 1
     return next((i for i in reversed(others) if timed[i]), nearest), units
-
-
-def _are_numbered(fields: list[str]) -> bool:
-    """Whether the fields of a header line are a time and channels by their numbers, as `Time, 1, 2`."""
-    return time_factor(fields[0]) is not None and all(field.isdecimal() for field in fields[1:])
 
 
 def _are_units(fields: Sequence[str], timed: set[int]) -> bool:
@@ -362,11 +327,7 @@ def _distinct_names(titles: Sequence[list[str]]) -> list[str]:
 
 
 def _row_of_numbers(path: Path, number: int, line: str, without_x: bool) -> Layout | None:
-    """The layout of a row of numbers, with leading time stamps or the empty column of LabVIEW; None for other rows.
-
-    Raises:
-        RecordFileError: numbers with both decimal points and decimal commas, or with thousands separators.
-    """
+    """The layout of a row of numbers, with leading time stamps or the empty column of LabVIEW; None for other rows."""
     for delimiter in DELIMITERS:
         if delimiter not in line and delimiter != ",":
             continue
@@ -404,11 +365,8 @@ def _fields(line: str, delimiter: str, trailing: bool) -> list[str]:
 def _names(path: Path, fields: Sequence[str], as_written: Sequence[str] = (), n_front: int = 0) -> tuple[str, ...]:
     """The names of columns, without blanks around them, of which all but the first must differ and not be empty.
 
-    Args:
-        path: of the file, for messages.
-        fields: the names.
-        as_written: the fields of the header line, with their blanks, for messages; those of `names` unless given.
-        n_front: number of columns before the first.
+    For messages, `as_written` are the fields of the header line with their blanks, and `n_front` is the number of
+    columns before the first.
     """
     names = tuple(name.strip() for name in fields)
     if all(_is_number(name, False) for name in names):

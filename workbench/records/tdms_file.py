@@ -40,10 +40,7 @@ def _check_whole(path: Path) -> None:
 
 
 def load(path: Path, limits: ReadLimits) -> dict[str, np.ndarray]:
-    """The channels of numbers, with units in brackets after their names, and `t` where the file has sample instants.
-
-    Sizes are checked first; to be called in a separate process.
-    """
+    """The channels of numbers, with units in brackets after their names, and `t` where the file has sample instants."""
     from nptdms import TdmsFile
 
     logging.getLogger("nptdms").handlers = [_Refused()]

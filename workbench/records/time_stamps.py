@@ -38,11 +38,7 @@ class Clock:
         self._date, self._days = "", 0  # of the last stamp, and midnights up to it
 
     def seconds(self, stamps: list[str]) -> np.ndarray:
-        """Seconds (n_stamps,) of dates with times of day, or of times of day alone, which may pass midnight.
-
-        Raises:
-            RecordFileError: a text that is no time stamp.
-        """
+        """Seconds (n_stamps,) of dates with times of day, or of times of day alone, which may pass midnight."""
         try:
             dates, clocks, zones = zip(*map(_parts, stamps))
             # in 03/05/2024 the month is unknown, and of no account where the date changes at midnight alone
@@ -69,11 +65,7 @@ class Clock:
 
 
 def _parts(stamp: str) -> tuple[str, str, int]:
-    """Date (or none), time of day in 24 hours, and minutes east of Greenwich (0 where unstated) of a time stamp.
-
-    Raises:
-        ValueError: no time stamp.
-    """
+    """Date (or none), time of day in 24 hours, and minutes east of Greenwich (0 where unstated) of a time stamp."""
     found = PARTS.fullmatch(stamp.replace('"', "").strip())
     if found is None:
         raise ValueError(f"{stamp[:40]!r}")

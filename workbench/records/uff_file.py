@@ -4,6 +4,7 @@ import json
 import re
 from collections.abc import Sequence
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -47,16 +48,11 @@ def load(path: Path, limits: ReadLimits) -> dict[str, np.ndarray]:
     frf = [s for s in sets if s["func_type"] == FRF]
     if frf:
         return _frfs(path, frf, system)
-    over_time = [
-        (number, entry)
-        for number, entry in enumerate(sets, start=1)
-        if entry["func_type"] in OVER_TIME and entry["abscissa_spec_data_type"] in TIME
-    ]
+    over_time = [(number, entry) for number, entry in enumerate(sets, start=1)
+                 if entry["func_type"] in OVER_TIME and entry["abscissa_spec_data_type"] in TIME]  # fmt: skip
     if not over_time:
-        held = [
-            ("complex " if np.iscomplexobj(s["data"]) else "") + FUNCTIONS.get(s["func_type"], f"type {s['func_type']}")
-            for s in sets
-        ]
+        held = [("complex " if np.iscomplexobj(s["data"]) else "")
+                + FUNCTIONS.get(s["func_type"], f"type {s['func_type']}") for s in sets]  # fmt: skip
         raise RecordFileError(
             f"{path} holds no signal over time and no FRF, but {', '.join(dict.fromkeys(held))}; export"
             " time responses (function type 1) or FRFs (4)"
@@ -140,16 +136,13 @@ def _frfs(path: Path, sets: list[dict[str, Any]], system: dict[str, Any] | None)
         remarks |= {unit_remark(name, text, unit): None
                     for name, text, unit in zip(pair, (output, reference), (top, bottom)) if unit}  # fmt: skip
     references = list(dict.fromkeys(pair[1] for pair in found))
-    mirrored = []
-    for output, reference in ((output, reference) for output in outputs for reference in references):
-        if (output, reference) in found:
-            continue
+    mirrored = [pair for pair in product(outputs, references) if pair not in found]
+    for output, reference in mirrored:
         if (reference, output) not in found or outputs[reference] != outputs[output]:
             raise RecordFileError(
                 f"{path} lacks the FRF from {reference} to {output}; export those of one reference, or of"
                 " all to every output"
             )
-        mirrored.append((output, reference))
     if mirrored:
         named = ", ".join(f"{reference} to {output}" for output, reference in mirrored)
         remarks[f"by reciprocity, those from {named}"] = None
@@ -199,11 +192,7 @@ def _label(entry: dict[str, Any], axis: str) -> str:
 
 
 def _abscissa(where: str, entry: dict[str, Any], quantity: str) -> np.ndarray:
-    """Instants in s, or lines in Hz.
-
-    Raises:
-        RecordFileError: a unit of another quantity, or that is not known.
-    """
+    """Instants in s, or lines in Hz."""
     label = _label(entry, "abscissa")
     unit, x = unit_named(label), np.asarray(entry["x"], float)
     if unit is not None and unit.quantity == quantity:
@@ -219,11 +208,7 @@ def _abscissa(where: str, entry: dict[str, Any], quantity: str) -> np.ndarray:
 
 
 def _measured(where: str, entry: dict[str, Any], axis: str, system: dict[str, Any] | None) -> tuple[str, str]:
-    """Quantity, by its code, and unit, as written or else by the file's system of units.
-
-    Raises:
-        RecordFileError: a unit of another quantity, or a system whose unit is not known.
-    """
+    """Quantity, by its code, and unit, as written or else by the file's system of units."""
     quantity, label = QUANTITIES.get(entry[f"{axis}_spec_data_type"], ""), _label(entry, axis)
     unit = unit_named(label)
     if unit is not None and quantity and unit.quantity in TYPES and unit.quantity != quantity:
@@ -241,11 +226,7 @@ def _measured(where: str, entry: dict[str, Any], axis: str, system: dict[str, An
 
 
 def write(path: Path, time: np.ndarray, signals: dict[str, Any], header: dict[str, Any]) -> None:
-    """Write one data set per signal, in double precision.
-
-    Raises:
-        RecordFileError: a channel whose description does not fit the format's five lines of 80 characters.
-    """
+    """Write one data set per signal, in double precision, its description in the format's five lines of text."""
     path.unlink(missing_ok=True)
     file = pyuff.UFF(str(path))
     for i, (facts, values) in enumerate(zip(header["channels"], signals.values(), strict=True)):
@@ -256,21 +237,9 @@ def write(path: Path, time: np.ndarray, signals: dict[str, Any], header: dict[st
         text = json.dumps(described, separators=(",", ":")).replace(" ", r"\u0020")
         if len(text) > 5 * LINE:
             raise RecordFileError(f"{path}: the names of channel {facts['name']!r} are too long for UFF; shorten them")
-        file.write_sets(
-            {
-                **{f"id{j + 1}": text[j * LINE : (j + 1) * LINE] or " " for j in range(5)},
-                "type": 58,
-                "func_type": 1,
-                "rsp_node": i + 1,
-                "rsp_dir": 3,
-                "ref_node": 1,
-                "ref_dir": 3,
-                "abscissa_spacing": 1,
-                "abscissa_spec_data_type": 17,
-                "ordinate_spec_data_type": TYPES.get(facts["quantity"], 0),
-                "orddenom_spec_data_type": 0,
-                "x": time,
-                "data": np.asarray(values, float),
-            },
-            mode="add",
-        )
+        lines = {f"id{j + 1}": text[j * LINE : (j + 1) * LINE] or " " for j in range(5)}
+        point = {"rsp_node": i + 1, "rsp_dir": 3, "ref_node": 1, "ref_dir": 3}
+        axes = {"abscissa_spacing": 1, "abscissa_spec_data_type": 17, "orddenom_spec_data_type": 0,
+                "ordinate_spec_data_type": TYPES.get(facts["quantity"], 0)}  # fmt: skip
+        numbers = {"x": time, "data": np.asarray(values, float)}
+        file.write_sets({"type": 58, "func_type": 1, **lines, **point, **axes, **numbers}, mode="add")

@@ -32,8 +32,7 @@ def load(path: Path, limits: ReadLimits) -> dict[str, np.ndarray]:
             f"{path} holds no displacements of normal modes at nodes (data sets 55 or 2414, analysis type 2, specific"
             " data type 8)"
         )
-    nodes = modes[0]["nodes"]
-    width = modes[0]["shape"].shape[1]
+    nodes, width = modes[0]["nodes"], modes[0]["shape"].shape[1]
     for number, mode in enumerate(modes, start=1):
         if mode["shape"].shape[1] != width or not np.array_equal(mode["nodes"], nodes):
             raise RecordFileError(f"{path}, mode {number} is given at other nodes or directions than the first")

@@ -7,17 +7,11 @@ from math import pi
 
 @dataclass(frozen=True)
 class Unit:
-    """A unit of measurement.
+    """A unit of measurement."""
 
-    Attributes:
-        factor: to SI.
-        si: the SI unit, as in `Channel.unit`.
-        quantity: what it measures, one of `QUANTITIES` or another word; empty where the unit does not determine it.
-    """
-
-    factor: float
-    si: str
-    quantity: str
+    factor: float  # to SI
+    si: str  # the SI unit, as in `Channel.unit`
+    quantity: str  # that it measures, one of `QUANTITIES` or another word; empty where it does not determine it
 
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
@@ -77,14 +71,8 @@ BRACKETED = re.compile(r"(.*?)\s*(?:\[\s*([^\[\]]*)\]|\(\s*((?:[^()]++|\([^()]*+
 AFTER_SLASH = re.compile(r"(.*\S)\s+(?:/|in)\s+(\S.*)")  # axis labels of DIN and ISO
 TIME = {"t", "time", "zeit", "temps", "tiempo", "x-axis", "timestamp", "time stamp", "elapsed time", "relative time"}
 # the clocks of Arduino, the instants of LabVIEW, and units that stand alone
-TIME_AS_UNIT = {
-    "x_value": "s",
-    "millis": "ms",
-    "micros": "us",
-    "milliseconds": "ms",
-    "microseconds": "us",
-    "seconds": "s",
-}
+TIME_AS_UNIT = {"x_value": "s", "millis": "ms", "micros": "us", "milliseconds": "ms", "microseconds": "us",
+                "seconds": "s"}  # fmt: skip
 TIME_UNDERSCORE = re.compile(r"(t|time)_(s|sec|ms|us)", re.IGNORECASE)
 NUMBERED = re.compile(r"(\S\D*?\S)\s+\d+\b.*")  # one time of several, as catman's `Time 1 - default sample rate`
 
@@ -101,8 +89,7 @@ def _our_spelling(text: str) -> str:
 
 
 def split_unit(name: str) -> tuple[str, str]:
-    """A column's name without its unit, and the unit as written: `Acc [g]`, `Acc (g)`, `Acc / g` and
-    `Acc in g` give (Acc, g).
+    """A column's name without its unit, and the unit as written, of `Acc [g]`, `Acc (g)`, `Acc / g` and `Acc in g`.
 
     Text in brackets that is not a unit belongs to the name.
     """
@@ -194,11 +181,7 @@ class Units:
         return SI_NAME.sub(lambda name: own[name[0]], unit)
 
     def taken(self, unit: Unit) -> Unit:
-        """A unit with its factor to this set instead of SI: of mm/s^2 the factor is 1 for lengths in mm and times in s.
-
-        Raises:
-            ValueError: a name of this set whose factor to SI is not known.
-        """
+        """A unit with its factor to this set instead of SI: that of mm/s^2 is 1 for lengths in mm and times in s."""
         factor, own = unit.factor, self._by_si()
         for below, name, power in POWERS.findall(unit.si):
             if own.get(name, name) != name:
@@ -208,19 +191,14 @@ class Units:
     @property
     def consistency(self) -> float | None:
         """A force of mass · length / time² in the unit of force; None where a name's factor to SI is not known."""
-        units = [unit_named(name) for name in (self.length, self.time, self.force)]
+        length, time, force = (unit_named(name) for name in (self.length, self.time, self.force))
         mass = MASSES.get(_our_spelling(self.mass))
-        if mass is None or not all(units):
+        if mass is None or length is None or time is None or force is None:
             return None
-        length, time, force = (unit.factor for unit in units if unit)
-        return mass * length / time**2 / force
+        return mass * length.factor / time.factor**2 / force.factor
 
     def check_known(self) -> None:
-        """Refuse a name whose factor to SI is not known, or that is of another quantity.
-
-        Raises:
-            ValueError: naming what it is of, the name, and the known ones.
-        """
+        """Refuse, by a ValueError, a name whose factor to SI is not known, or that is of another quantity."""
         names = {what: BY_QUANTITY[quantity][1] for what, quantity in NAMED_BY.items()}
         for what, known in (*names.items(), ("mass", MASSES)):
             name = getattr(self, what)

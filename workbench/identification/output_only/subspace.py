@@ -56,26 +56,16 @@ SUBSPACE = SubspaceSettings()
 
 @dataclass(frozen=True, eq=False)
 class StablePole:
-    """A mode that is stable over the model orders.
+    """A mode that is stable over the model orders."""
 
-    Attributes:
-        pole: λ, rad/s.
-        shape: (n_outputs,) complex, in the quantities of the outputs.
-        presence: share of the orders at which it was found.
-        statistic: twice the log-likelihood ratio, by one-step prediction, of the record with and without the mode.
-        orders, poles: model orders at which it was found, and its pole at each.
-        decimation: ratio of the record's sampling rate to the one at which it was found.
-        variance: (2, 2) of Re λ and Im λ; nan until estimated.
-    """
-
-    pole: complex
-    shape: np.ndarray
-    presence: float
-    statistic: float
-    orders: tuple[int, ...]
-    poles: tuple[complex, ...]
-    decimation: int
-    variance: np.ndarray
+    pole: complex  # λ, rad/s
+    shape: np.ndarray  # (n_outputs,) complex, in the quantities of the outputs
+    presence: float  # share of the orders at which it was found
+    statistic: float  # twice the log-likelihood ratio, by one-step prediction, with and without the mode
+    orders: tuple[int, ...]  # at which it was found
+    poles: tuple[complex, ...]  # at each of these
+    decimation: int  # ratio of the record's sampling rate to the one at which it was found
+    variance: np.ndarray  # (2, 2) of Re λ and Im λ; nan until estimated
 
 
 class Subspace:
@@ -99,7 +89,7 @@ class Subspace:
                 distinct.append(mode)
         return distinct
 
-    def with_errors(self, modes: Sequence[StablePole], time_limit: TimeLimit | None = None) -> list[StablePole]:
+    def with_errors(self, modes: Sequence[StablePole], time_limit: TimeLimit) -> list[StablePole]:
         """The modes with their variance by the jackknife, from as many blocks as the time allows, four at least.
 
         The variance is scaled so that a normal interval of 95 % is that of Student's t with n_blocks - 1 degrees of
@@ -109,11 +99,11 @@ class Subspace:
             return []
         jackknife: list[list[np.ndarray]] = []
         for b in range(SUBSPACE.blocks):
-            if time_limit is not None and b >= SUBSPACE.least_blocks and time_limit.spent("standard errors"):
+            if b >= SUBSPACE.least_blocks and time_limit.spent("standard errors"):
                 break
             jackknife.append(self._poles_without(b, modes))
-        n, freedom = len(jackknife), len(jackknife) - 1
-        scale = (student.ppf(0.975, freedom) / student.ppf(0.975, np.inf)) ** 2 * (SUBSPACE.blocks - 1) / n
+        n = len(jackknife)
+        scale = (student.ppf(0.975, n - 1) / student.ppf(0.975, np.inf)) ** 2 * (SUBSPACE.blocks - 1) / n
         estimates = []
         for r, mode in enumerate(modes):
             replicates = np.array([one[r] for one in jackknife])
@@ -158,8 +148,8 @@ class Subspace:
                 if not (0 < -pole.real < SUBSPACE.most_damped * abs(pole) and low < abs(pole) < top):
                     continue
                 gain *= self.n_samples / decimation
-                own = (order,), (complex(pole),)
-                mode = StablePole(complex(pole), shape, 0.0, gain, *own, decimation, np.full((2, 2), np.nan))
+                found = complex(pole)
+                mode = StablePole(found, shape, 0.0, gain, (order,), (found,), decimation, np.full((2, 2), np.nan))
                 others = [group for group in groups if group[-1].orders[0] != order]
                 distances = [_distance(mode, group[-1]) for group in others]
                 if min(distances, default=np.inf) < SUBSPACE.near:
@@ -184,9 +174,9 @@ def _median_mode(group: Sequence[StablePole], orders: range) -> StablePole:
     """The mode nearest the median of a group, with the orders and poles for its errors."""
     poles = np.array([mode.pole for mode in group])
     nearest = int(np.argmin(np.abs(poles - np.median(poles.real) - 1j * np.median(poles.imag))))
-    taken, share = group[:: 1 + len(group) // SUBSPACE.most_taken], len(group) / len(orders)
-    each = tuple(mode.orders[0] for mode in taken), tuple(mode.pole for mode in taken)
-    return replace(group[nearest], presence=share, orders=each[0], poles=each[1])
+    taken = group[:: 1 + len(group) // SUBSPACE.most_taken]
+    orders_taken, poles_taken = zip(*((mode.orders[0], mode.pole) for mode in taken))
+    return replace(group[nearest], presence=len(group) / len(orders), orders=orders_taken, poles=poles_taken)
 
 
 class Model:
@@ -215,11 +205,9 @@ class Model:
         return int(np.clip(2 * np.sum(self._correlations > noise), SUBSPACE.least_order, SUBSPACE.most_order))
 
     def poles(self, order: int, statistic: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The poles of a model in the upper half plane.
+        """The poles of a model in the upper half plane, as ln μ (n_poles,) of the discrete poles μ.
 
-        Returns:
-            ln μ (n_poles,) of the discrete poles μ, shapes (n_outputs, n_poles), and with `statistic` the test
-            statistic of each pole per sample, (n_poles,), else zeros.
+        With their shapes (n_outputs, n_poles) and the test statistic of each per sample (n_poles,), if asked for.
         """
         c = self._c[:, :order]
         mu, vectors = np.linalg.eig(self._a[:order, :order])
@@ -254,6 +242,7 @@ def _covariances(outputs: np.ndarray, n_lags: int) -> np.ndarray:
     The biased estimate is positive definite.
     """
     n = outputs.shape[1]
-    lines = np.fft.rfft(outputs, next_fast_len(n + n_lags, real=True))
-    covariances = np.fft.irfft(lines[:, None] * lines.conj(), next_fast_len(n + n_lags, real=True))
+    size = next_fast_len(n + n_lags, real=True)
+    lines = np.fft.rfft(outputs, size)
+    covariances = np.fft.irfft(lines[:, None] * lines.conj(), size)
     return np.ascontiguousarray(covariances[..., :n_lags].transpose(2, 0, 1) / n)

@@ -76,21 +76,16 @@ DERIVATIVES = ("value", "slope", "curvature", "change of curvature")
 def peano_kernel(
     spline: Spline, x: np.ndarray, positions: np.ndarray, length: float, derivative: int = 0
 ) -> np.ndarray:
-    """K(x, u) √du on a grid of u, (n_points, n_cells); the sum of squares of a row is the mean square error for τ² = 1.
+    """K(x, u) √du, or a derivative by x, on a grid of u, (n_points, n_cells), of a spline through the sensors.
 
-    Args:
-        spline: through the sensors at `positions`.
-        x: (n_points,) m.
-        positions: (n_sensors,) m.
-        length: m.
-        derivative: of K by x.
+    The sum of squares of a row is the mean square error for τ² = 1. `x` (n_points,), `positions` (n_sensors,), m.
     """
     order = min(BANDS.order, spline.degree + 1)
     u = (np.arange(BANDS.cells) + 0.5) * length / BANDS.cells
-    of_conditions = [_power(np.array([at]), u, order, d)[0] for at, d in spline.conditions]
     interpolated = spline.matrix(x, derivative) @ _power(positions, u, order)
-    if of_conditions:
-        interpolated = interpolated + spline.of_held(x, derivative) @ np.array(of_conditions)
+    if spline.conditions:
+        of_conditions = np.array([_power(np.array([at]), u, order, d)[0] for at, d in spline.conditions])
+        interpolated = interpolated + spline.of_held(x, derivative) @ of_conditions
     return np.asarray((_power(x, u, order, derivative) - interpolated) * np.sqrt(length / BANDS.cells))
 
 
@@ -105,9 +100,8 @@ class LeaveOneOut:
             try:
                 spline = interpolating_spline(positions[others], length=length, ends=ends, degree=degree)
             except ValueError as error:
-                raise ValueError(
-                    f"{n} sensors are too few to cross-validate a spline of degree {degree}: {error}"
-                ) from error
+                few = f"{n} sensors are too few to cross-validate a spline of degree {degree}"
+                raise ValueError(f"{few}: {error}") from error
             self.rule[j, j] = 1.0
             self.rule[j, others] = -spline.matrix(positions[j])[0]
             kernels.append(peano_kernel(spline, positions[j : j + 1], positions[others], length)[0])
@@ -153,24 +147,13 @@ def _power(x: np.ndarray, u: np.ndarray, order: int, derivative: int = 0) -> np.
 
 
 def check_ends(found: ShapeEstimates, ends: BoundaryConditions, *, length: float) -> None:
-    """Refuse boundary conditions that the shapes contradict; with fewer than about five sensors none is refused.
-
-    Args:
-        found: shapes at placed sensors, with their covariance.
-        ends: the stated boundary conditions.
-        length: m.
-
-    Raises:
-        ValueError: a boundary condition that the shapes contradict.
-    """
+    """Refuse, by a ValueError, ends that the shapes contradict; with fewer than about five sensors none is refused."""
     check_along(found.modes)
     values, positions = normalised_shapes(found.modes.shapes).real, found.modes.positions
     for name, end_x in (("left", 0.0), ("right", length)):
         conditions = [d for x, d in ends.zeros if abs(x - end_x) <= 1e-9 * length]
-        other_conditions = BoundaryConditions(
-            tuple(zero for zero in ends.zeros if abs(zero[0] - end_x) > 1e-9 * length)
-        )
-        extrapolated = _extrapolated(positions, other_conditions, end_x, conditions, length) if conditions else None
+        others = BoundaryConditions(tuple(zero for zero in ends.zeros if abs(zero[0] - end_x) > 1e-9 * length))
+        extrapolated = _extrapolated(positions, others, end_x, conditions, length) if conditions else None
         if extrapolated is None:
             continue
         rows, error, leave_one_out = extrapolated
@@ -196,17 +179,14 @@ def check_ends(found: ShapeEstimates, ends: BoundaryConditions, *, length: float
 
 
 def _extrapolated(
-    positions: np.ndarray, other_conditions: BoundaryConditions, at: float, conditions: list[int], length: float
+    positions: np.ndarray, others: BoundaryConditions, at: float, conditions: list[int], length: float
 ) -> tuple[np.ndarray, np.ndarray, LeaveOneOut] | None:
-    """Linear rules by which the sensors extrapolate derivatives to an end; None where the sensors are too few.
+    """Linear rules by which the sensors extrapolate derivatives to an end, (n_conditions, n_sensors); unit the length.
 
-    The length is the unit.
-
-    Returns:
-        The rules, (n_conditions, n_sensors); their interpolation error, (n_conditions, n_cells); the leave-one-out
-        prediction of the same splines.
+    With their interpolation error (n_conditions, n_cells), and the leave-one-out prediction of the same splines. None
+    where the sensors are too few.
     """
-    options: dict[str, Any] = {"length": length, "ends": other_conditions}
+    options: dict[str, Any] = {"length": length, "ends": others}
     x = np.array([at])
     for degree in BANDS.degrees:
         try:
@@ -266,12 +246,7 @@ class Bands(Printed):
 
 
 def deviation_and_width(root: np.ndarray, level: float, rng: np.random.Generator) -> tuple[np.ndarray, float]:
-    """Standard errors (n_points,) of a curve of error covariance R Rᵀ, and the width of its simultaneous band.
-
-    Args:
-        root: R, (n_points, any).
-        level: probability that the whole curve lies within so many standard errors.
-    """
+    """Standard errors (n_points,) of a curve of error covariance R Rᵀ, by R, and the width of its simultaneous band."""
     std = np.linalg.norm(root, axis=1)
     uncertain = std > BANDS.held * std.max()
     if not uncertain.any():
@@ -285,14 +260,8 @@ def propagated(
 ) -> tuple[np.ndarray, ...]:
     """A mass-normalised curve φ = W v (n_points,), and its changes W - φ ∫ m φ W dx by errors of any kind.
 
-    Args:
-        values: v (n_sensors,), such that ∫ m φ² dx = 1.
-        at: W (n_points, n_sensors), and errors of the curve (n_points, n_errors), which change it alike.
-        inside: the same at places inside, (n_places, ...).
-        weights: (n_places,) the mass at each of these.
-
-    Returns:
-        φ, and (n_points, ...) the change for each of `at`.
+    `at` is W (n_points, n_sensors), and errors of the curve (n_points, n_errors), which change it alike; `inside` the
+    same at (n_places,) inside, each of the mass `weights`. There is a change for each of `at`.
     """
     phi = at[0] @ values
     load = weights * (inside[0] @ values)
@@ -332,9 +301,9 @@ def eigenfunction_bands(
     x = np.atleast_1d(np.asarray(x, float))
     check_level(level)
     slack = 1e-9 * length
-    if not ((x >= -slack) & (x <= length + slack)).all():
-        outside = x[~((x >= -slack) & (x <= length + slack))][0]
-        raise ValueError(f"x = {outside:g} lies outside the structure, 0 to {length:g}")
+    outside = ~((x >= -slack) & (x <= length + slack))
+    if outside.any():
+        raise ValueError(f"x = {x[outside][0]:g} lies outside the structure, 0 to {length:g}")
     if ends is not None:
         check_ends(found, ends, length=length)
     modes, rng = found.modes, np.random.default_rng(seed)

@@ -6,7 +6,7 @@ them; the others are removed by leaving out the knots nearest to that end ("not 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, cast
 from warnings import warn
 
@@ -58,7 +58,7 @@ class BoundaryConditions:
         Raises:
             ValueError: an end of unknown name.
         """
-        zeros, essential = [], []
+        zeros = []
         for at, end in ((0.0, left), (float(length), right)):
             if end is None:
                 continue
@@ -66,27 +66,18 @@ class BoundaryConditions:
                 known = ", ".join(f"{e} {k}" for k, e in ZERO_AT)
                 raise ValueError(f"no boundary condition of a {kind!r} is called {end!r}; there are {known}")
             zeros += [(at, derivative) for derivative in ZERO_AT[kind, end]]
-            essential += [(at, d) for d in ZERO_AT[kind, end] if d < ESSENTIAL_BELOW[kind]]
-        return cls(tuple(zeros), tuple(essential))
+        return cls(tuple(zeros), tuple((at, d) for at, d in zeros if d < ESSENTIAL_BELOW[kind]))
 
 
 @dataclass(frozen=True, eq=False)
 class Spline:
-    """The linear map from values at the sensors to a spline along the structure.
+    """The linear map from values at the sensors to a spline along the structure."""
 
-    Attributes:
-        knots: (n_functions + degree + 1,) of the B-splines, m.
-        degree: odd.
-        weights: (n_functions, n_sensors): coefficients = weights @ values.
-        conditions: boundary conditions used, (x, derivative) each.
-        held_weights: (n_functions, n_conditions): change of the coefficients per unit value of each condition.
-    """
-
-    knots: np.ndarray
-    degree: int
-    weights: np.ndarray = field(repr=False)
-    conditions: tuple[tuple[float, int], ...] = ()
-    held_weights: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
+    knots: np.ndarray  # (n_functions + degree + 1,) of the B-splines, m
+    degree: int  # odd
+    weights: np.ndarray  # (n_functions, n_sensors): coefficients = weights @ values
+    conditions: tuple[tuple[float, int], ...]  # boundary conditions used, (x, derivative) each
+    held_weights: np.ndarray  # (n_functions, n_conditions): change of the coefficients per unit value of each condition
 
     def matrix(self, x: np.ndarray, derivative: int = 0) -> np.ndarray:
         """Values (or derivatives) at x per value at each sensor, (n_points, n_sensors)."""
@@ -121,16 +112,16 @@ def interpolating_spline(
     at_sensors = np.asarray(positions, float)
     _check_places(at_sensors, length, degree)
     slack = 1e-9 * length
-    elsewhere = [at for at, _ in ends.zeros if min(abs(at), abs(at - length)) > slack]
-    if elsewhere:
-        raise ValueError(
-            f"a boundary condition holds at x = {elsewhere[0]:g}, which is no end of the structure, 0 to {length:g};"
-            " give both the same length"
-        )
+    for at, _ in ends.zeros:
+        if min(abs(at), abs(at - length)) > slack:
+            raise ValueError(
+                f"a boundary condition holds at x = {at:g}, which is no end of the structure, 0 to {length:g};"
+                " give both the same length"
+            )
     conditions = _usable(ends.zeros, degree, length)
-    held_places = [at for at, derivative in conditions if derivative == 0]
-    used = np.array([all(abs(x - at) > slack for at in held_places) for x in at_sensors], bool)
-    sites = np.union1d(at_sensors[used], np.array(held_places))
+    held_places = np.array([at for at, derivative in conditions if derivative == 0])
+    used = (np.abs(at_sensors[:, None] - held_places) > slack).all(axis=1)
+    sites = np.union1d(at_sensors[used], held_places)
     derivatives = [(at, d) for at, d in conditions if d > 0]
     n_functions = sites.size + len(derivatives)
     if n_functions < degree + 1:
@@ -139,8 +130,7 @@ def interpolating_spline(
             f" add sensors or take degree {max(1, n_functions - 1 - n_functions % 2)}"
         )
     knots = _knots(sites, derivatives, length, degree)
-    unit = np.eye(n_functions)
-    basis = BSpline(knots, unit, degree)
+    basis = BSpline(knots, np.eye(n_functions), degree)
     rows = [basis(at_sensors[used])] + [basis(at, d)[None] * length**d for at, d in conditions]
     inverse = np.linalg.inv(np.vstack(rows))
     weights = np.zeros((n_functions, at_sensors.size))
@@ -209,17 +199,11 @@ def eigenfunctions(
 def best_degrees(
     sampled: SampledModes, *, length: float, ends: BoundaryConditions = BoundaryConditions()
 ) -> np.ndarray:
-    """The spline degree among 3, 5, 7 and 9 that best predicts each inner sensor from the others, (n_modes,).
-
-    Args:
-        sampled: shapes of displacement at placed sensors.
-        length: m.
-        ends: boundary conditions.
-    """
+    """The spline degree among 3, 5, 7 and 9 that best predicts each inner sensor from the others, (n_modes,)."""
     check_along(sampled)
     values = normalised_shapes(sampled.shapes).real
     order = np.argsort(sampled.positions)
-    errors, degrees = [], []
+    errors = []
     for degree in DEFAULT_DEGREES:
         squares = np.zeros(sampled.n_modes)
         try:
@@ -230,10 +214,8 @@ def best_degrees(
         except ValueError:
             break  # too few sensors for this degree, and so for any higher one
         errors.append(squares)
-        degrees.append(degree)
-    if not degrees:
-        return np.full(sampled.n_modes, DEFAULT_DEGREES[0])
-    return np.asarray(np.array(degrees)[np.argmin(errors, axis=0)])
+    best = np.argmin(errors, axis=0) if errors else np.zeros(sampled.n_modes, int)
+    return np.asarray(np.array(DEFAULT_DEGREES)[best])
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,11 +250,8 @@ def mass_quadrature(
 ) -> tuple[np.ndarray, np.ndarray, tuple[tuple[np.ndarray, int], ...]]:
     """∫ m φ² dx + Σ (M_k φ² + J_k φ'²) of splines φ = W v as Σ weights (rule v)²: a sum of squares does not cancel.
 
-    The mass is that of `eigenfunctions`; by default one that gives ∫ φ_r² dx = length.
-
-    Returns:
-        weights (n_terms,); rule (n_terms, n_sensors), φ or φ' per value at each sensor; and the places of the terms,
-        (n_places,) m, with the order of the derivative, in turn.
+    The weights (n_terms,); the rule (n_terms, n_sensors), φ or φ' per value at each sensor; and the places of the
+    terms, (n_places,) m, with the order of the derivative, in turn.
     """
     if mass_per_length is None and len(point_masses):
         raise ValueError("point masses are used beside a mass distribution; give mass_per_length too")
@@ -295,11 +274,7 @@ def mass_quadrature(
 
 
 def check_along(sampled: SampledModes) -> None:
-    """Refuse sensors that are not all placed along an interval.
-
-    Raises:
-        ValueError: a sensor without a place, or with one of another kind.
-    """
+    """Refuse, by a ValueError, sensors that are not all placed along an interval."""
     check_placed(sampled)
     if not sampled.on_interval:
         raise ValueError(

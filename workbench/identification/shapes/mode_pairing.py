@@ -43,11 +43,9 @@ class ModePairing(Printed):
 
 
 def repeated_modes(omega: np.ndarray, repeated: float = 1e-3) -> np.ndarray:
-    """Cluster number of each mode, (n_modes,), equal for repeated modes: consecutive frequencies within `repeated`.
+    """Cluster number of each mode, (n_modes,), equal for repeated modes.
 
-    Args:
-        omega: (n_modes,) frequencies, not decreasing.
-        repeated: largest relative step of frequency from one mode to the next.
+    Their frequencies `omega`, which must not decrease, step by less than a share `repeated` from one to the next.
     """
     return np.cumsum(np.r_[False, np.diff(omega) > repeated * np.maximum(omega[1:], 1e-300)])
 
@@ -92,12 +90,8 @@ def assigned(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Optimal assignment of two sets of shapes: rows, columns, and the `subspace_mac`, (n_first, n_second).
 
-    Among repeated modes, of equal subspace MAC, the plain MAC decides.
-
-    Args:
-        first, second: as `subspace_mac` takes them.
-        cluster: (n_second,) cluster number of each shape of the second set.
-        least: MAC below which a pair is none.
+    Among repeated modes, of equal subspace MAC and cluster number (n_second,), the plain MAC decides. A pair of a MAC
+    below `least` is none.
     """
     second = _without_rounding(second)
     agreement = _cluster_mac(first, second, cluster)
@@ -125,9 +119,8 @@ def pair_modes(measured: SampledModes, model: Modes, *, shape: float = 0.9, freq
     check_finite(measured.shapes)
     model_shapes, cluster = model.phi(measured.positions), repeated_modes(model.omega)
     rows, columns, agreement = assigned(measured.shapes, model_shapes, cluster, least=shape)
-    paired = agreement[rows, columns] >= shape
-    rows, columns = rows[paired], columns[paired]
-    order = np.argsort(columns)
+    paired = np.flatnonzero(agreement[rows, columns] >= shape)
+    order = paired[np.argsort(columns[paired])]
     rows, columns = rows[order], columns[order]
     elastic, consistent, scale = model.omega[columns] > 0.0, np.zeros(rows.size, bool), 1.0
     if elastic.any():

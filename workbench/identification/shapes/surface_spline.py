@@ -20,29 +20,16 @@ from scipy.stats import chi2
 
 from workbench.arrays import symmetric_root
 from workbench.identification.shapes.bands import BANDS, Bands, deviation_and_width, propagated
-from workbench.identification.signal.modal_estimates import (
-    ShapeEstimates,
-    check_level,
-    check_placed,
-    normalised_shapes,
-)
+from workbench.identification.signal.modal_estimates import ShapeEstimates, check_level, check_placed, normalised_shapes
 from workbench.structure.domain import Rectangle
 from workbench.structure.modes import Modes, SampledModes, frozen
 from workbench.structure.profile import FieldLike, as_field
 from workbench.structure.supports import SIDES
 from workbench.threads import one_blas_thread
 
-
-@dataclass(frozen=True)
-class SurfaceSettings:
-    """Constants of splines over a rectangle."""
-
-    per_edge: int = 11  # points of an edge at which its conditions are imposed
-    quadrature: int = 49  # number of modes for which the integration points over the rectangle suffice
-    same_place: float = 1e-6  # of the diagonal: sensors closer than this are at one place
-
-
-SURFACE = SurfaceSettings()
+PER_EDGE = 11  # points of an edge at which its conditions are imposed
+QUADRATURE = 49  # number of modes for which the integration points over the rectangle suffice
+SAME_PLACE = 1e-6  # of the diagonal: sensors closer than this are at one place
 POWER = 3.5  # of |p|², the kernel |p|⁷
 CUBIC = tuple((i, j) for i in range(4) for j in range(4 - i))  # powers of x and y of zero energy
 HELD_BY = {"simply supported": (0,), "clamped": (0, 1), "free": (), "guided": (1,)}
@@ -68,15 +55,13 @@ def _kernel(offset: np.ndarray, derivative: tuple[int, int]) -> np.ndarray:
 
 def _cubics(at: np.ndarray, derivative: tuple[int, int]) -> np.ndarray:
     """A derivative of every cubic monomial at places (n, 2): (n, 10)."""
-    columns = []
-    for powers in CUBIC:
-        column = np.ones(len(at))
+    columns = np.ones((len(at), len(CUBIC)))
+    for k, powers in enumerate(CUBIC):
         for axis, (power, order) in enumerate(zip(powers, derivative, strict=True)):
             below = power - order
             falling = np.prod(np.arange(power, below, -1)) if below >= 0 else 0.0
-            column = column * falling * at[:, axis] ** max(below, 0)
-        columns.append(column)
-    return np.column_stack(columns)
+            columns[:, k] = columns[:, k] * falling * at[:, axis] ** max(below, 0)
+    return columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +91,7 @@ class SurfaceSpline:
                     f"edges are given by side, {', '.join(SIDES)}, as {', '.join(HELD_BY)}; got {side} {edge!r}"
                 )
         gaps = np.linalg.norm(self.places[:, None] - self.places, axis=2) + np.eye(len(self.places)) * self.domain.size
-        if gaps.min() < SURFACE.same_place * self.domain.size:
+        if gaps.min() < SAME_PLACE * self.domain.size:
             i, j = np.unravel_index(int(gaps.argmin()), gaps.shape)
             raise ValueError(f"sensors {i + 1} and {j + 1} are at one place, {self.places[i]} m; keep one of them")
         if np.linalg.matrix_rank(self._equations[:, -len(CUBIC) :]) < len(CUBIC):
@@ -126,17 +111,17 @@ class SurfaceSpline:
         for side in (side for side, edge in self._edge_of.items() if 0 in HELD_BY[edge]):
             axis, far = divmod(SIDES.index(side), 2)
             distance = np.abs(self.places[:, axis] - far * self.domain.length[axis])
-            used &= distance > SURFACE.same_place * self.domain.size
+            used &= distance > SAME_PLACE * self.domain.size
         return used
 
     @cached_property
     def _functionals(self) -> list[Functional]:
         """The sensors used, and points along the edges, each with a derivative that is zero there."""
         functionals: list[Functional] = [(self.places[self._used], (0, 0))]
-        share = (np.arange(SURFACE.per_edge) + 0.5) / SURFACE.per_edge
+        share = (np.arange(PER_EDGE) + 0.5) / PER_EDGE
         for side, edge in self._edge_of.items():
             axis, far = divmod(SIDES.index(side), 2)
-            points = np.empty((SURFACE.per_edge, 2))
+            points = np.empty((PER_EDGE, 2))
             points[:, axis], points[:, 1 - axis] = far * self.domain.length[axis], share * self.domain.length[1 - axis]
             functionals += [(points, (order, 0) if axis == 0 else (0, order)) for order in HELD_BY[edge]]
         return functionals
@@ -174,14 +159,10 @@ class SurfaceSpline:
         return matrix
 
     def error(self, at: np.ndarray, derivatives: Sequence[tuple[int, int]] = ((0, 0),)) -> np.ndarray:
-        """Covariance of the interpolation error for τ² = 1, (n_derivatives n_at, n_derivatives n_at).
-
-        Of one derivative after another, at places (n_at, 2).
-        """
+        """Covariance of the interpolation error for τ² = 1, of one derivative after another at places (n_at, 2)."""
         offset = (at[:, None] - at) / self.domain.size
-        prior_covariance = np.block(
-            [[(-1.0) ** (k + m) * _kernel(offset, (i + k, j + m)) for k, m in derivatives] for i, j in derivatives]
-        )
+        prior_covariance = np.block([[(-1.0) ** (k + m) * _kernel(offset, (i + k, j + m)) for k, m in derivatives]
+                                     for i, j in derivatives])  # fmt: skip
         rows = np.vstack([self._rows(at, d) for d in derivatives])
         scale = np.repeat([self.domain.size ** -sum(d) for d in derivatives], len(at))
         return np.asarray((prior_covariance - rows @ self._system @ rows.T) * np.outer(scale, scale))
@@ -189,10 +170,8 @@ class SurfaceSpline:
     def roughness(self, values: np.ndarray, covariance: np.ndarray) -> float:
         """Upper confidence limit of τ² of values (n_places,) of known covariance; 0 where they may be noise.
 
-        By the likelihood of the contrasts orthogonal to all cubics (restricted maximum likelihood).
-
-        Raises:
-            ValueError: no more values and edge points than the ten of a cubic.
+        By the likelihood of the contrasts orthogonal to all cubics (restricted maximum likelihood), of which there must
+        be one.
         """
         values, covariance = values[self._used], covariance[np.ix_(self._used, self._used)]
         n, size = values.size, len(self._equations)
@@ -372,7 +351,7 @@ def _scaled(
 
 def _weighted(domain: Rectangle, mass_per_area: FieldLike | None) -> tuple[np.ndarray, np.ndarray]:
     """Integration points (n, 2), m, and the mass that each represents."""
-    x, weights = domain.quadrature(SURFACE.quadrature)
+    x, weights = domain.quadrature(QUADRATURE)
     density = as_field(1.0 / float(np.prod(domain.length)) if mass_per_area is None else mass_per_area)
     values = density(x[:, 0], x[:, 1])
     negative = ~(values >= 0.0)

@@ -50,11 +50,8 @@ class Basis:
 
     Attributes:
         functions: x (n_points,) -> (n_points, n_terms).
-        n_terms: number of functions.
+        n_terms: number of functions, 0 or more.
         breaks: places where they are not smooth, m.
-
-    Raises:
-        ValueError: a negative number of functions.
     """
 
     functions: Callable[[np.ndarray], np.ndarray] = field(repr=False)
@@ -77,11 +74,7 @@ class Basis:
 
     @classmethod
     def splines(cls, n_terms: int, *, length: float, degree: int = 2) -> "Basis":
-        """B-splines on equal intervals: local functions, each zero over most of the structure.
-
-        Raises:
-            ValueError: fewer terms than degree + 1.
-        """
+        """B-splines on equal intervals, degree + 1 or more: local functions, each zero over most of the structure."""
         if n_terms < degree + 1:
             raise ValueError(f"B-splines of degree {degree} are at least {degree + 1}; asked for {n_terms}")
         nodes = np.linspace(0.0, length, n_terms - degree + 1)
@@ -146,14 +139,13 @@ class Distributions(Printed):
     orthogonality: float
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
-        terms = (
-            f"{what} in {counted(distribution.basis.n_terms, 'term')}"
-            for what, distribution in (("mass", self.mass), ("stiffness", self.stiffness))
+        mass, stiffness = (counted(each.basis.n_terms, "term") for each in (self.mass, self.stiffness))
+        line = (
+            f"mass in {mass}, stiffness in {stiffness} from {counted(self.scales.size, 'mode')}, orthogonal to"
+            f" {self.orthogonality:.2g}"
         )
-        rows = zip(*columns(self.mass, self.length), *columns(self.stiffness, self.length)[1:])
-        line = f"{', '.join(terms)} from {counted(self.scales.size, 'mode')},"
-        line += f" orthogonal to {self.orthogonality:.2g}"
-        return line, ("x [m]", "mass [kg/m]", "±", "stiffness", "±"), list(rows), self.remarks
+        rows = printed_rows(self.length, self.mass, self.stiffness)
+        return line, ("x [m]", "mass [kg/m]", "±", "stiffness", "±"), rows, self.remarks
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -162,15 +154,16 @@ class Distributions(Printed):
         for what, distribution in (("mass", self.mass), ("stiffness", self.stiffness)):
             error = distribution.std(x).mean() / np.abs(distribution(x)).mean()
             if np.isnan(error):
-                text = "has no standard error, as no mode can be left out: use more modes"
-            elif error > RELIABLE:
-                text = (
-                    f"is uncertain by {100 * error:.2g} %, as single modes left out show; up to {100 * RELIABLE:g} %"
-                    " it is reliable. Derivatives of noisy shapes are poor: use more sensors"
+                remarks.append(
+                    f"the {what} has no standard error, as no mode can be left out: use more modes, fewer terms, or"
+                    " choose_structure"
                 )
-            else:
-                continue
-            remarks.append(f"the {what} {text}, fewer terms, or choose_structure")
+            elif error > RELIABLE:
+                remarks.append(
+                    f"the {what} is uncertain by {100 * error:.2g} %, as single modes left out show; up to"
+                    f" {100 * RELIABLE:g} % it is reliable. Derivatives of noisy shapes are poor: use more sensors,"
+                    " fewer terms, or choose_structure"
+                )
         if self.orthogonality > RELIABLE:
             remarks.append(
                 f"two modes are orthogonal only to {self.orthogonality:.2g}, at most {RELIABLE:g} where mass and"
@@ -180,11 +173,11 @@ class Distributions(Printed):
         return tuple(remarks)
 
 
-def columns(of: Any, length: float) -> tuple[Sequence[str], Sequence[str], Sequence[str]]:
-    """Columns of a printed distribution with a `std`: places, values and their standard errors."""
+def printed_rows(length: float, *distributions: Any) -> list[tuple[str, ...]]:
+    """Rows of printed distributions with a `std`: a place, then value and standard error of each."""
     x = np.linspace(0.0, length, PRINTED)
-    values, errors = zip(*(rounded(value, error) for value, error in zip(of(x), of.std(x), strict=True)))
-    return [f"{at:.4g}" for at in x], values, errors
+    numbers = zip(x, *(zip(each(x), each.std(x), strict=True) for each in distributions), strict=True)
+    return [(f"{at:.4g}", *(text for pair in pairs for text in rounded(*pair))) for at, *pairs in numbers]
 
 
 @warns_of_remarks
@@ -250,8 +243,8 @@ def _distributions(
     orthogonality = float(np.abs(gram / np.outer(scales, scales) - np.eye(scales.size)).max())
     try:
         others = [identified(unit.select([s for s in range(modes.n_modes) if s != r])) for r in range(modes.n_modes)]
-        mass = replace(mass, left_out=frozen(np.array([other[0].coefficients for other in others])))
-        stiffness = replace(stiffness, left_out=frozen(np.array([other[1].coefficients for other in others])))
+        mass = replace(mass, left_out=frozen([other[0].coefficients for other in others]))
+        stiffness = replace(stiffness, left_out=frozen([other[1].coefficients for other in others]))
     except ValueError:
         pass  # too few relations without one of the modes
     return Distributions(mass, stiffness, frozen(scales / scale), modes.length, orthogonality)
@@ -265,22 +258,14 @@ def _quadrature(modes: Modes, breaks: Sequence[float]) -> tuple[Floats, Floats]:
 
 
 def known_masses(domain: Domain, known: Sequence[tuple[Any, float]]) -> tuple[np.ndarray, Floats]:
-    """`known_values` of a mass, at least one.
-
-    Raises:
-        ValueError: none; as `known_values`.
-    """
+    """`known_values` of a mass, at least one."""
     if len(known) == 0:
         raise ValueError("orthogonality determines the mass only up to a factor; give the mass at one point or more")
     return known_values(domain, known, "mass")
 
 
 def known_values(domain: Domain, known: Sequence[tuple[Any, float]], what: str) -> tuple[np.ndarray, Floats]:
-    """Places, as `domain.locate` returns them, and the values (n_known,) of a distribution there.
-
-    Raises:
-        ValueError: a value that is not positive, or a place that the domain does not have.
-    """
+    """Places, as `domain.locate` returns them, and the positive values (n_known,) of a distribution there."""
     places, values = domain.locate([place for place, _ in known]), np.array([value for _, value in known], float)
     for (place, _), value in zip(known, values, strict=True):
         if not (np.isfinite(value) and value > 0):
@@ -365,15 +350,7 @@ def _check_terms(what: str, n_terms: int, n_relations: int, n_modes: int) -> Non
 
 
 def held_exactly(rows: np.ndarray, values: np.ndarray, what: str, size: float) -> tuple[np.ndarray, np.ndarray]:
-    """A particular solution c of rows @ c = values, and the null space of rows (n_terms, n_free).
-
-    Args:
-        what: description of the values.
-        size: scale of the values, for the tolerance.
-
-    Raises:
-        ValueError: values that no coefficients give.
-    """
+    """A particular solution c of rows @ c = values (`what`, of scale `size`), and the null space (n_terms, n_free)."""
     particular = np.linalg.lstsq(rows, values, rcond=None)[0]
     error = np.abs(rows @ particular - values).max()
     if error > KNOWN_TOLERANCE * size:
@@ -404,10 +381,10 @@ class SelfCheck(Printed):
     refusal: str = ""
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
-        each = enumerate(zip(self.frequency_errors, self.mac, strict=True))
-        rows = [(str(r + 1), f"{100 * error:.3g}", f"{agreement:.4f}") for r, (error, agreement) in each]
         if self.refusal:
             return f"identified structure against measurement: {self.refusal}", (), (), ()
+        each = enumerate(zip(self.frequency_errors, self.mac, strict=True))
+        rows = [(str(r + 1), f"{100 * error:.3g}", f"{agreement:.4f}") for r, (error, agreement) in each]
         line = f"identified structure against measurement: largest frequency error {100 * self.worst:.3g} %"
         return line, ("mode", "frequency [%]", "MAC"), rows, ()
 

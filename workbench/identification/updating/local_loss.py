@@ -47,8 +47,7 @@ class LossSettings:
 
     places: int = 60  # along the structure, at which losses are tried
     typical_width: float = 0.1  # of the length: its inverse is the number of independent places that are tested
-    # of the length: a search converges to a loss from half to twice its width
-    widths: tuple[float, ...] = (0.05, 0.1, 0.2, 0.4)
+    widths: tuple[float, ...] = (0.05, 0.1, 0.2, 0.4)  # of the length: a search converges from half to twice the width
     most_starts: int = 2  # of each width
     most_looks: int = 4  # searches along the structure after the first, at most
     first_terms: int = 3  # of mass and stiffness in the first search, at most
@@ -92,13 +91,14 @@ class LocatedDamage(Printed):
     @property
     def detected(self) -> bool:
         """Whether a loss is detected: it is significant, explains the modes, and does so better than a point mass."""
-        return self.statistic > self.threshold and self._explains_roughly(self.damaged) and not self._is_mass
+        return self.statistic > self.threshold and self._explains_roughly(self.damaged) and self._by_mass is None
 
     @property
-    def _is_mass(self) -> bool:
-        """Whether a point mass explains the modes, and better than a loss."""
+    def _by_mass(self) -> FittedStructure | None:
+        """The fit with a point mass where it explains the modes, and better than a loss."""
         mass = self.with_mass
-        return mass is not None and mass.criterion < self.damaged.criterion and self._explains_roughly(mass)
+        better = mass is not None and mass.criterion < self.damaged.criterion and self._explains_roughly(mass)
+        return mass if better else None
 
     @staticmethod
     def _explains_roughly(fit: FittedStructure) -> bool:
@@ -113,9 +113,7 @@ class LocatedDamage(Printed):
     @property
     def best(self) -> FittedStructure:
         """The fit to use."""
-        if self.detected:
-            return self.damaged
-        return self.with_mass if self._is_mass and self.with_mass is not None else self.undamaged
+        return self.damaged if self.detected else self._by_mass or self.undamaged
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         test = f"statistic {self.statistic:.3g}, threshold {self.threshold:.3g}"
@@ -129,14 +127,13 @@ class LocatedDamage(Printed):
     @property
     def remarks(self) -> tuple[str, ...]:
         """Other explanations of the modes, and whether the modes are explained at all."""
-        remarks, loss, chi2_with_loss = [], self.damaged.loss, self.damaged.chi2
+        remarks, loss, chi2_with_loss, mass = [], self.damaged.loss, self.damaged.chi2, self._by_mass
         assert loss is not None, "damaged is an explanation with a loss"
-        if self.with_mass is not None and self._is_mass:
-            part = self.with_mass.structure.attachments[-1]
+        if mass is not None:
+            part = mass.structure.attachments[-1]
             remarks.append(
                 f"a point mass of {part.pair[0]:.3g} kg at {part.at:.4g} m, which the nominal structure lacks,"
-                f" explains the modes better than a loss: χ² {self.with_mass.chi2:.4g}, {chi2_with_loss:.4g} with the"
-                " loss"
+                f" explains the modes better than a loss: χ² {mass.chi2:.4g}, {chi2_with_loss:.4g} with the loss"
             )
         if not self.best.explains:
             place = f"{100 * loss.share:.2g} % at {loss.centre:.4g} m"
@@ -217,8 +214,8 @@ def _damaged(candidates: Candidates) -> FittedStructure:
     for _ in range(LOSS.most_looks):
         if damaged.explains or n_fewer >= max(damaged.n_terms):
             break
-        n_mass, n_stiffness = (n - n_fewer for n in damaged.n_terms)
-        fewer = max(n_mass, candidates.mass_terms[0]), max(n_stiffness, candidates.stiffness_terms[0])
+        least = candidates.mass_terms[0], candidates.stiffness_terms[0]
+        fewer = (max(n - n_fewer, fewest) for n, fewest in zip(damaged.n_terms, least, strict=True))
         other = _from_scan(candidates.problem(*fewer), damaged)
         if other.criterion < damaged.criterion - 1.0:
             damaged, n_fewer = _best_beside(candidates, other), 0
@@ -240,10 +237,9 @@ def _undamaged(candidates: Candidates, damaged: FittedStructure, threshold: floa
     """The best fit without a loss; a single fit where it suffices to decide the test."""
 
     def fit_of(*n_terms: int) -> FittedStructure | None:
-        try:
+        with suppress(ValueError):
             return fitted(candidates.problem(*n_terms), damaged)
-        except ValueError:
-            return None
+        return None
 
     equal_terms = fit_of(*damaged.n_terms)
     if equal_terms is not None and equal_terms.chi2 - damaged.chi2 <= threshold:
@@ -257,7 +253,7 @@ def _undamaged(candidates: Candidates, damaged: FittedStructure, threshold: floa
 def _with_mass(candidates: Candidates, damaged: FittedStructure) -> FittedStructure | None:
     """The best fit without a loss but with one more point mass; None where no fit converges."""
     best: FittedStructure | None = None
-    for n_terms in {_first_terms(candidates): None, damaged.n_terms: None}:
+    for n_terms in dict.fromkeys((_first_terms(candidates), damaged.n_terms)):
         problem = candidates.problem(*n_terms)
         starts = [(intact, part) for intact in _without_loss(problem) for part in _likely_masses(problem, intact)]
         if best is not None:
@@ -394,8 +390,5 @@ def _fit_near_mass(problem: Problem, near: FittedStructure, part: PointMass) -> 
     bounds = np.r_[np.full(n_free, -np.inf), least], np.r_[np.full(n_free, np.inf), most]
     z = CachedResidual(fit).least(start, PROBLEM.most_steps, bounds=bounds, ftol=1e-5)
     found = report(_with_point_mass(problem, *(z[-2:] * scale)), z[:-2])
-    return replace(
-        found,
-        degrees_of_freedom=found.degrees_of_freedom - 2,
-        criterion=found.criterion + 2.0 * problem.task.penalty,
-    )
+    penalised = found.criterion + 2.0 * problem.task.penalty
+    return replace(found, degrees_of_freedom=found.degrees_of_freedom - 2, criterion=penalised)

@@ -210,9 +210,8 @@ def update_model(
 def _joined(cluster: np.ndarray, model_shapes: np.ndarray, measured: np.ndarray, omega: np.ndarray) -> np.ndarray:
     """Cluster of each of the model's modes (n_modes,), joined as the modes measured as repeated.
 
-    Each group of measured repeated modes joins the clusters of the modes whose shapes are most nearly in its span.
-    Without this, a model whose parameters separate two modes slightly more would lose the measured shapes, and the
-    search would end there.
+    Each group of measured repeated modes joins the clusters of the modes whose shapes are most nearly in its span. Else
+    a model whose parameters separate two modes slightly more would lose the measured shapes, and end the search.
     """
     cluster, order = cluster.copy(), np.argsort(omega)
     repeated = np.empty(omega.size, int)

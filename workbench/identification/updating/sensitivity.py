@@ -32,16 +32,11 @@ APART = 1e-6  # least distance of nodes over the length
 
 @dataclass(frozen=True)
 class LocalLoss:
-    """A share of the stiffness lost over part of the structure.
+    """A share of the stiffness lost over part of the structure, which is cut off at the ends."""
 
-    Attributes:
-        share: δ of the stiffness there, below 1.
-        centre, width: of the part, m; the part is cut off at the ends of the structure.
-    """
-
-    share: float
-    centre: float
-    width: float
+    share: float  # δ of the stiffness there, below 1
+    centre: float  # of the part, m
+    width: float  # of the part, m
 
     def edges(self, length: float) -> tuple[float, float]:
         """Begin and end of the part within the structure, m."""
@@ -59,46 +54,30 @@ class LocalLoss:
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """Elastic modes and their derivatives.
+    """Elastic modes and their derivatives."""
 
-    Attributes:
-        omega: (n_modes,) rad/s.
-        shapes: (n_sensors, n_modes), mass-normalised.
-        omega_by: (n_modes, n_parameters) derivatives of ω.
-        shapes_by: (n_sensors, n_modes, n_parameters) derivatives of the shapes.
-    """
-
-    omega: np.ndarray
-    shapes: np.ndarray
-    omega_by: np.ndarray
-    shapes_by: np.ndarray
+    omega: np.ndarray  # (n_modes,) rad/s
+    shapes: np.ndarray  # (n_sensors, n_modes), mass-normalised
+    omega_by: np.ndarray  # (n_modes, n_parameters)
+    shapes_by: np.ndarray  # (n_sensors, n_modes, n_parameters)
 
 
 @dataclass(frozen=True, eq=False)
 class SeriesStructure:
-    """A nominal structure with series for the relative changes of its mass and stiffness.
+    """A nominal structure with series for the relative changes of its mass and stiffness."""
 
-    Attributes:
-        nominal: ends, attachments, m_0 and k_0.
-        mass, stiffness: M_j and K_j.
-        positions: (n_sensors,) of the sensors, m.
-        n_modes: number of the lowest modes that are resolved.
-    """
-
-    nominal: Bar | Beam
-    mass: Basis
-    stiffness: Basis
-    positions: np.ndarray
-    n_modes: int
+    nominal: Bar | Beam  # ends, attachments, m_0 and k_0
+    mass: Basis  # M_j
+    stiffness: Basis  # K_j
+    positions: np.ndarray  # (n_sensors,) of the sensors, m
+    n_modes: int  # number of the lowest modes that are resolved
 
     @property
     def bases(self) -> tuple[Basis, Basis]:
-        """M_j and K_j."""
         return self.mass, self.stiffness
 
     @property
     def nominal_profiles(self) -> tuple[Profile, Profile]:
-        """m_0 and k_0."""
         return self.nominal.mass_per_length, self.nominal.stiffness
 
     def solve(self, d: np.ndarray, e: np.ndarray, loss: LocalLoss | None = None) -> "SolvedSeries | None":
@@ -197,15 +176,10 @@ class SolvedSeries:
 class _Mesh:
     """The discretisation, with nodes at all places where something jumps, and at the edges of a loss.
 
-    Attributes:
-        segments: the functions.
-        x, weights: (n_points,) Gauss points and weights.
-        values, strains: (n_points, n_functions) functions and their highest derivatives there.
-        nominal_mass, nominal_stiffness: (n_points,) m_0 and k_0.
-        mass_terms, stiffness_terms: (n_points, n_terms) M_j and K_j.
-        checked_mass, checked_stiffness: the same where `member` checks that mass and stiffness are positive.
-        fixed_mass, fixed_stiffness: matrices of attachments, springs and tension.
-        free: indices of the functions that the ends do not hold.
+    At the Gauss points x, with weights (n_points,), it holds the functions and their highest derivatives, values and
+    strains (n_points, n_functions), m_0 and k_0 (n_points,), and the terms M_j and K_j (n_points, n_terms), these also
+    where `member` checks that mass and stiffness are positive; besides, the fixed matrices of attachments, springs and
+    tension, and the free functions, which the ends do not hold.
     """
 
     def __init__(self, series: SeriesStructure, edges: tuple[float, ...]) -> None:

@@ -16,7 +16,7 @@ from scipy.stats import chi2 as chi2_distribution
 from workbench.arrays import Floats, symmetric_root
 from workbench.identification.signal.modal_estimates import RefinedModes
 from workbench.identification.signal.searches import CachedResidual
-from workbench.identification.updating.distributions import Basis, SelfCheck, columns
+from workbench.identification.updating.distributions import Basis, SelfCheck, printed_rows
 from workbench.identification.updating.sensitivity import LocalLoss
 from workbench.identification.updating.structure_problem import PROBLEM, GaussianPrior, Problem, Task
 from workbench.renamed import Renamed
@@ -42,22 +42,16 @@ STRUCTURE = StructureSettings()
 
 @dataclass(frozen=True, eq=False, repr=False)
 class UncertainProfile(Printed):
-    """A distribution along the structure, with its uncertainty.
+    """A distribution along the structure, with its uncertainty."""
 
-    Attributes:
-        profile: the maximum likelihood estimate.
-        others: x (n_points,) -> (n_draws, n_points), Monte Carlo samples of the distribution.
-        length: of the structure, m.
-    """
-
-    profile: Profile
-    others: Callable[[np.ndarray], np.ndarray]
-    length: float
+    profile: Profile  # the maximum likelihood estimate
+    others: Callable[[np.ndarray], np.ndarray]  # x (n_points,) -> (n_draws, n_points), Monte Carlo samples
+    length: float  # of the structure, m
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         low, high = self.extent
         line = f"from {low:.4g} to {high:.4g} over {self.length:.4g} m"
-        return line, ("x [m]", "value", "±"), list(zip(*columns(self, self.length))), ()
+        return line, ("x [m]", "value", "±"), printed_rows(self.length, self), ()
 
     @property
     def extent(self) -> tuple[float, float]:
@@ -122,8 +116,7 @@ class FittedStructure(Printed):
             f" {verb} the {counted(self.numbers.size, 'mode')} measured (χ² {self.chi2:.4g}, at most {self.limit:.4g})"
         )
         k = "EI [N m²]" if isinstance(self.structure, Beam) else "EA [N]"
-        length = self.structure.length
-        rows = list(zip(*columns(self.mass, length), *columns(self.stiffness, length)[1:]))
+        rows = printed_rows(self.structure.length, self.mass, self.stiffness)
         return line, ("x [m]", "mass [kg/m]", "±", k, "±"), rows, self.remarks
 
     @property
@@ -179,8 +172,7 @@ def fitted(problem: Problem, near: FittedStructure | None = None, loss: LocalLos
     residuals = CachedResidual(problem.residuals)
 
     def search(z: np.ndarray) -> np.ndarray:
-        tolerances = {"ftol": 1e-5, "xtol": 1e-9, "gtol": 1e-9}
-        return residuals.least(z, PROBLEM.most_steps, bounds=(low, high), **tolerances)
+        return residuals.least(z, PROBLEM.most_steps, bounds=(low, high), ftol=1e-5, xtol=1e-9, gtol=1e-9)
 
     found = search(z)
     if loss is not None:
@@ -249,12 +241,7 @@ def report(problem: Problem, z: np.ndarray) -> FittedStructure:
 
 
 def _uncertain(
-    nominal: Profile,
-    basis: Basis,
-    coefficients: np.ndarray,
-    draws: np.ndarray,
-    length: float,
-    loss: LocalLoss | None = None,
+    nominal: Profile, basis: Basis, coefficients: Floats, draws: Floats, length: float, loss: LocalLoss | None = None
 ) -> UncertainProfile:
     """The distribution nominal (1 + series) (1 - loss), with Monte Carlo samples of coefficients and loss."""
 
@@ -348,11 +335,7 @@ class Candidates:
     def of(
         cls, task: Task, basis: Callable[[int], Basis] | None, mass_terms: Iterable[int], stiffness_terms: Iterable[int]
     ) -> "Candidates":
-        """The arguments as of `choose_structure`.
-
-        Raises:
-            ValueError: no number of terms.
-        """
+        """The arguments as of `choose_structure`."""
         basis = basis or partial(Basis.legendre, length=task.nominal.length)
         candidates = cls(task, basis, sorted(mass_terms), sorted(stiffness_terms))
         if not (candidates.mass_terms and candidates.stiffness_terms):
@@ -387,7 +370,7 @@ class Candidates:
                 if (i, j) in tried or i >= len(self.mass_terms) or j >= len(self.stiffness_terms):
                     continue
                 tried.add((i, j))
-                starts = [start for start in (best, near) if start is not None]
+                starts = filter(None, (best, near))
                 start = min(starts, key=lambda start: start.criterion, default=None)
                 try:
                     fits[i, j] = fit(self.problem(self.mass_terms[i], self.stiffness_terms[j]), start)

@@ -74,28 +74,17 @@ class GaussianPrior:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """The measured modes, in units of their standard errors, and what is known beforehand of mass and stiffness.
-
-    Attributes:
-        measured, nominal: as `fit_structure` takes them.
-        known: of mass, of stiffness: places and values, (n_known,) each.
-        priors: of mass, of stiffness.
-        which: (n_modes,) elastic mode of the structure, from 0, of each measured one.
-        reference: (n_modes,) the sensor where each shape is 1.
-        shapes: (n_sensors, n_modes) real.
-        unit_omega: (n_modes, n_modes) whitening matrix of the errors of ω.
-        unit_shapes: likewise of the shape of each mode at all sensors but its reference.
-    """
+    """The measured modes, in units of their standard errors, and what is known beforehand of mass and stiffness."""
 
     measured: RefinedModes
     nominal: Bar | Beam
-    known: tuple[tuple[np.ndarray, Floats], tuple[np.ndarray, Floats]]
-    priors: tuple[GaussianPrior | None, GaussianPrior | None]
-    which: np.ndarray
-    reference: np.ndarray
-    shapes: np.ndarray
-    unit_omega: np.ndarray
-    unit_shapes: tuple[np.ndarray, ...]
+    known: tuple[tuple[np.ndarray, Floats], tuple[np.ndarray, Floats]]  # of mass, of stiffness: places and values
+    priors: tuple[GaussianPrior | None, GaussianPrior | None]  # of mass, of stiffness
+    which: np.ndarray  # (n_modes,) elastic mode of the structure, from 0, of each measured one
+    reference: np.ndarray  # (n_modes,) the sensor where each shape is 1
+    shapes: np.ndarray  # (n_sensors, n_modes) real
+    unit_omega: np.ndarray  # (n_modes, n_modes) whitening matrix of the errors of ω
+    unit_shapes: tuple[np.ndarray, ...]  # likewise of the shape of each mode at all sensors but its reference
 
     @classmethod
     def of(
@@ -170,41 +159,37 @@ def _whitening_matrix(covariance: np.ndarray, least: float = 1e-12) -> Floats:
     return np.asarray((vectors / np.sqrt(np.maximum(values, least * values.max()))).T)
 
 
+def cramer_rao_bound(slopes: np.ndarray) -> Floats:
+    """Covariance of parameters, from the Jacobian (n_rows, n_parameters) of residuals in standard errors."""
+    return scaled_inverse(slopes.T @ slopes, INDISTINCT)
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """χ² of a structure of given terms, as a function of its free parameters z.
 
     z are the coefficients that the known values leave free, and share, centre and width of a loss if there is one.
-
-    Attributes:
-        task: the data.
-        series: the structure.
-        held: of mass, of stiffness: c_0 and F of their coefficients c_0 + F z, which have the known values.
     """
 
     task: Task
     series: SeriesStructure
+    # of mass, of stiffness: c_0 and F of their coefficients c_0 + F z, which have the known values
     held: tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
     @classmethod
     def of(cls, task: Task, mass: Basis, stiffness: Basis) -> "Problem":
-        """The problem of a task with given series.
-
-        Raises:
-            ValueError: common factor unknown, more terms than data, known values the series cannot take.
-        """
+        """The problem of a task with given series."""
         is_known = any(x.size for x, _ in task.known) or task.priors != (None, None)
         if mass.n_terms and stiffness.n_terms and not is_known:
             raise ValueError(
                 "modes determine mass and stiffness only up to a common factor; give known_mass at a point,"
                 " known_stiffness, or a prior"
             )
-        series = SeriesStructure(
-            task.nominal, mass, stiffness, task.measured.modes.positions, int(task.which.max()) + 1
-        )
-        held = []
+        positions = task.measured.modes.positions
+        series = SeriesStructure(task.nominal, mass, stiffness, positions, int(task.which.max()) + 1)
+        held, names = [], ("masses", "stiffnesses")
         for basis, nominal, (x, values), what in zip(
-            series.bases, series.nominal_profiles, task.known, ("masses", "stiffnesses"), strict=True
+            series.bases, series.nominal_profiles, task.known, names, strict=True
         ):
             if basis.n_terms and x.size:
                 ratios = values / nominal(x) - 1.0
@@ -278,9 +263,8 @@ class Problem:
         coefficients = np.r_[d, e]
         for root, columns in self._prior_roots:
             rows.append(root @ coefficients[columns])
-            slope = np.zeros((len(root), slopes[0].shape[1]))
-            slope[:, columns] = root
-            slopes.append(slope)
+            slopes.append(np.zeros((len(root), slopes[0].shape[1])))
+            slopes[-1][:, columns] = root
         return np.concatenate(rows), np.vstack(slopes) @ self.coefficient_jacobian(z)
 
     def start(self) -> Floats:
@@ -291,8 +275,8 @@ class Problem:
         solved = self.series.solve(*self.parts(z))
         if solved is None:
             return z
-        ratios = self.task.measured.modes.omega**2 / solved.eigenvalues[solved.n_rigid + self.task.which]
-        ratio = float(np.median(ratios))
+        lowest = solved.eigenvalues[solved.n_rigid + self.task.which]
+        ratio = float(np.median(self.task.measured.modes.omega**2 / lowest))
         (_, free), (known_at, _) = self.held[1], self.task.known[1]
         if free.shape[1] and not known_at.size:  # the stiffness is free to be scaled
             return self.nearest(mass, stiffness * ratio)
@@ -313,22 +297,18 @@ class Problem:
         such an edge is that of an edge one standard error inside.
         """
         if z.size == self.n_free:
-            slopes = self.residuals(z)[1]
-            return scaled_inverse(slopes.T @ slopes, INDISTINCT)
+            return cramer_rao_bound(self.residuals(z)[1])
         from_edges = block_diag(np.eye(z.size - 2), FROM_EDGES)
         return np.asarray(from_edges @ self._edge_covariance(self.edges_inside(z)) @ from_edges.T)
 
     def _edge_covariance(self, z: np.ndarray) -> Floats:
         """The Cramér-Rao bound with the edges of the loss in place of centre and width."""
         slopes = self.residuals(z)[1]
-        slopes = np.hstack([slopes[:, :-2], slopes[:, -2:] @ FROM_EDGES])
-        return scaled_inverse(slopes.T @ slopes, INDISTINCT)
+        return cramer_rao_bound(np.hstack([slopes[:, :-2], slopes[:, -2:] @ FROM_EDGES]))
 
     def edges_inside(self, z: np.ndarray) -> np.ndarray:
         """z with each edge of the loss at least one standard error inside the ends; z itself where they are."""
-        for edge, inward in enumerate((1.0, -1.0)):
-            z = self._edge_inside(z, edge, inward)
-        return z
+        return self._edge_inside(self._edge_inside(z, 0, 1.0), 1, -1.0)
 
     def _edge_inside(self, z: np.ndarray, edge: int, inward: float) -> np.ndarray:
         width, length = z[-1], self.series.nominal.length

@@ -174,13 +174,9 @@ def plate_mass_and_stiffness(
     size = np.sqrt((shapes**2).mean(axis=0))
     places, values = known_masses(modes.domain, known_mass)
     held = mass_basis.functions(*places.T)
+    residual = values - prior_mass(*places.T)
     coefficients, misfit, gram = mass_series(
-        shapes / size,
-        weights,
-        mass_basis.functions(x, y),
-        prior_mass(x, y),
-        held,
-        values - prior_mass(*places.T),
+        shapes / size, weights, mass_basis.functions(x, y), prior_mass(x, y), held, residual
     )
     mass, a_squared = SurfaceDistribution(frozen(coefficients), mass_basis, prior_mass, misfit), np.diag(gram)
     strains = [
@@ -208,8 +204,7 @@ def _stiffness_covariance(
 ) -> np.ndarray:
     """Covariance (n_terms, n_terms) of the coefficients of the stiffness, from the errors of the modes.
 
-    Args:
-        known: (n_known, n_terms) functions of the mass at the places where it is held.
+    `known` are the functions of the mass at the places where it is held, (n_known, n_terms).
     """
     assert isinstance(modes.domain, Rectangle)
     at, weights = modes.domain.quadrature(QUADRATURE_OF_ERRORS)
@@ -246,9 +241,8 @@ def _stiffness_covariance(
     def series(form: np.ndarray, basis: SurfaceBasis, pairs: tuple[np.ndarray, ...]) -> np.ndarray:
         """Coefficient matrix U of the relations, (n_pairs, n_terms)."""
         functions = weights[:, None] * basis.functions(x, y)
-        return np.asarray(
-            np.einsum("ab,apk,bpk,pj->kj", form, fields[:, :, pairs[0]], fields[:, :, pairs[1]], functions)
-        )
+        first, second = (fields[:, :, modes] for modes in pairs)
+        return np.asarray(np.einsum("ab,apk,bpk,pj->kj", form, first, second, functions))
 
     free = null_space(known)
     mass_by_residual = -free @ np.linalg.pinv(series(inertia, mass.basis, different) @ free)
@@ -268,9 +262,8 @@ def _stiffness_covariance(
     interpolation_error, roughness = errors.spline.error(at, DERIVATIVES), scale**2 * errors.roughness
     by_noise = stiffness_change @ spline_rows.reshape(-1, spline_rows.shape[2])
     covariance = (by_noise @ noise @ by_noise.swapaxes(1, 2)).sum(axis=0)
-    covariance += np.einsum(
-        "r,rij->ij", roughness, stiffness_change @ interpolation_error @ stiffness_change.swapaxes(1, 2)
-    )
+    by_interpolation = stiffness_change @ interpolation_error @ stiffness_change.swapaxes(1, 2)
+    covariance += np.einsum("r,rij->ij", roughness, by_interpolation)
     # the energy of the errors themselves adds up over the modes, and matters where curvatures are inaccurate
     local_error = np.einsum("apbp->pab", interpolation_error.reshape(4, len(at), 4, len(at)))
     energies = [
@@ -313,19 +306,12 @@ def check_plate(
     if not isinstance(measured.domain, Rectangle):
         raise ValueError(f"m(x, y) and D(x, y) are those of a plate; these modes are on {measured.domain}")
     # Edges that no plate has are no fault of what was identified.
-    plate = Plate(
-        length=measured.domain.length,
-        mass_per_area=1.0,
-        bending_stiffness=1.0,
-        poisson_ratio=poisson_ratio,
-        edges=edges,
-    )
+    sides = measured.domain.length
+    plate = Plate(length=sides, mass_per_area=1.0, bending_stiffness=1.0, poisson_ratio=poisson_ratio, edges=edges)
     share = np.linspace(0.0, 1.0, PER_SIDE)
-    grid = np.stack(np.meshgrid(*(side * share for side in measured.domain.length), indexing="ij"), axis=-1)
-    return compared(
-        lambda: replace(plate, mass_per_area=found.mass.field, bending_stiffness=found.stiffness.field),
-        measured,
-        first_mode,
-        tolerance,
-        grid.reshape(-1, 2),
-    )
+    grid = np.stack(np.meshgrid(*(side * share for side in sides), indexing="ij"), axis=-1)
+
+    def built() -> Plate:
+        return replace(plate, mass_per_area=found.mass.field, bending_stiffness=found.stiffness.field)
+
+    return compared(built, measured, first_mode, tolerance, grid.reshape(-1, 2))
