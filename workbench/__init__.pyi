@@ -1,5 +1,5 @@
 # The public names and where each lives: what editors and type checkers read, and what `__init__.py` imports when a
-# name is first used. Everything else comes from its room: `from workbench.rig.elements import CubicSpring`.
+# name is first used. Everything else is imported from its subpackage: `from workbench.rig.elements import CubicSpring`.
 
 from .cases.case import read_case as read_case
 from .design.estimation.observers import kalman_controller as kalman_controller

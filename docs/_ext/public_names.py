@@ -1,4 +1,4 @@
-"""The directive `public-names`: the reference of a room's public names, from their docstrings."""
+"""The directive `public-names`: the reference of a subpackage's public names, from their docstrings."""
 
 import inspect
 import re
@@ -18,9 +18,9 @@ DOCS = Path(__file__).resolve().parents[1]
 
 
 def public_names() -> dict[str, str]:
-    """Dotted path of each public name -> its room: the names of `workbench` first, then those of the rooms' files.
+    """Dotted path of each public name -> its subpackage, the names of `workbench` itself first.
 
-    Of the rooms' files, names that `workbench` once had, and those that a page of the documentation imports.
+    The others are those that `workbench` once had, and those that a page of the documentation imports.
     """
     core = [(module.split(".")[0], name) for name, module in homes().items()]
     pages = "\n".join(page.read_text(encoding="utf-8") for page in sorted(DOCS.rglob("*.md")))
@@ -28,7 +28,7 @@ def public_names() -> dict[str, str]:
     named = {name for _, name in core}
     shown = {f"{module}.{name}" for module, names in imported for name in names.split(", ") if name not in named}
     further = sorted(path for path in shown.union(workbench.RENAMED.values()) if "." in path)
-    return {f"workbench.{name}": room for room, name in core} | {
+    return {f"workbench.{name}": subpackage for subpackage, name in core} | {
         f"workbench.{path}": path.split(".")[0] for path in further
     }
 
@@ -50,7 +50,7 @@ def docstring_of(path: str) -> str:
 
 
 class PublicNames(SphinxDirective):
-    """`.. public-names:: ROOM core` documents the names `wb.NAME` of a room, `... further` those of its files.
+    """`.. public-names:: NAME core` documents the names `wb.X` of a subpackage, `... further` those of its modules.
 
     A table of the names with the first paragraph of each comes first.
     """
@@ -58,9 +58,11 @@ class PublicNames(SphinxDirective):
     required_arguments = 2
 
     def run(self) -> list[nodes.Node]:
-        room, part = self.arguments
+        subpackage, part = self.arguments
         paths = [
-            path for path, home in public_names().items() if home == room and (path.count(".") == 1) == (part == "core")
+            path
+            for path, home in public_names().items()
+            if home == subpackage and (path.count(".") == 1) == (part == "core")
         ]
         lines = [".. list-table::", "   :widths: 35 65", ""] if paths else []
         for path in paths:
@@ -78,7 +80,7 @@ class PublicNames(SphinxDirective):
                 lines += [f".. py:data:: {path}", "", f"   {escaped(docstring_of(path))}", ""]
         parent = nodes.section()
         parent.document = self.state.document
-        self.state.nested_parse(StringList(lines, source=f"public names of {room}"), self.content_offset, parent)
+        self.state.nested_parse(StringList(lines, source=f"public names of {subpackage}"), self.content_offset, parent)
         return parent.children
 
 
