@@ -268,7 +268,7 @@ def test_points_go_through_a_file_unchanged(tmp_path):
         (PLATE.replace("[0.3, 0.2]", '[0.3, 0.2]\nquantity = "moment"\naxis = "z"'), POINTS, "direction 'x' or 'y'"),
         (PLATE.replace("[0.3, 0.2]", '[0.3, 0.2]\nquantity = "torque"'), POINTS, "quantity is force or moment"),
         (PLATE.replace("[0.3, 0.2]", '[0.3, 0.2]\ndirection = "z"'), POINTS, "no key 'direction'"),
-        (PLATE.replace('"actuator"\nat', '"hammer"\nquantity = "moment"\nat'), POINTS, "a hammer gives a force"),
+        (PLATE.replace('"actuator"\nat', '"hammer"\nquantity = "moment"\nat'), POINTS, "hammer is a measured force"),
         (FRAME.replace('"a.x"', '"a.x"\ndirection = "z"'), POINTS, "point 'a.x' has no direction 'z'; it has x, y"),
         (FRAME.replace('"b.y"', '"b.y"\naxis = "z"'), POINTS, "'a1': a force or displacement.* has no axis"),
         (FRAME.replace('"acceleration"', '"slope"'), POINTS, "'b.y' is no rotation: give a point of direction rx"),

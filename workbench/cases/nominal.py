@@ -250,7 +250,7 @@ def _actuator(entry: dict[str, Any], at: Place, modes: Modes) -> Actuator:
     """An input: a force, a moment, or a piezo patch."""
     kind, where = entry.get("kind"), f"[[input]] {entry['name']!r}"
     if kind not in ("actuator", "hammer"):
-        raise CaseError(f"{where}: kind is actuator or hammer; got {shown(kind)}")
+        raise CaseError(f"{where}: kind is actuator (a command) or hammer (a measured force); got {shown(kind)}")
     if "patch" in entry:
         actuator = _patch(entry, at, where)
     else:
@@ -259,7 +259,7 @@ def _actuator(entry: dict[str, Any], at: Place, modes: Modes) -> Actuator:
             raise CaseError(f"{where}: quantity is {' or '.join(ACTING)}; got {shown(quantity)}")
         turning = quantity == "moment"
         if turning and kind == "hammer":
-            raise CaseError(f"{where}: a hammer gives a force; for a moment the kind is actuator")
+            raise CaseError(f"{where}: kind hammer is a measured force; for a moment the kind is actuator")
         direction = _direction(entry, turning, where)
         actuator = Actuator(entry["name"], at, quantity, direct=kind == "hammer", direction=direction)
     _check_place(actuator, modes, where)

@@ -32,8 +32,8 @@ class Actuator(Constructed):
         delay: s.
         time_constant: of a first-order lag, s.
         bias: constant force that is added, N.
-        direct: a measured force applied without an actuator, such as of a hammer; effects on actuators leave it
-            unchanged.
+        direct: a measured force that acts without an actuator between, as of an impact hammer or of a shaker with a
+            force transducer; effects on actuators leave it unchanged.
         direction: of the force, or the axis of the moment, where the structure has more than one at a place.
         shape_error: (n_modes,) error of each mode shape, or of its slope, at this place; empty for none.
         crosstalk: (name, share) of other inputs whose commands are added.

@@ -79,7 +79,7 @@ def bench_of(case: Case) -> Bench:
     """
     rows = [j for j, a in enumerate(case.rig.actuators) if not a.direct]
     if not rows:
-        raise ValueError("every input of the case is a hammer; a trial needs an actuator to command")
+        raise ValueError("every input of the case is a measured force (hammer); a trial needs an actuator to command")
     strongest = max(case.fit, key=lambda record: np.mean(record.inputs[rows] ** 2, axis=1).max())
     squares = np.mean(strongest.inputs[rows] ** 2, axis=1)
     if not squares.max() > 0:
