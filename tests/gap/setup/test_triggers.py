@@ -62,9 +62,12 @@ def test_records_of_late_and_early_triggers_are_named_and_brought_to_the_others_
     records = delayed(rig, 0.0, 3.0, 1.0, -2.0)
     faults = setup_faults(rig, records[:2], records[2:])
     assert [fault.sentence for fault in faults] == [
-        "The record high is 3 samples late beside low, by its trigger: shift all its outputs 3 samples earlier.",
-        "The record check is 1 sample late beside low, by its trigger: shift all its outputs 1 sample earlier.",
-        "The record other is 2 samples early beside low, by its trigger: shift all its outputs 2 samples later.",
+        "The outputs of record high are 3 samples late relative to those of record low (trigger offset):"
+        " shift them all 3 samples earlier.",
+        "The outputs of record check are 1 sample late relative to those of record low (trigger offset):"
+        " shift them all 1 sample earlier.",
+        "The outputs of record other are 2 samples early relative to those of record low (trigger offset):"
+        " shift them all 2 samples later.",
     ]
     assert all(fault.kind == "late record" and fault.closes > 0.99 for fault in faults)
     kept_rig, fit = without_faults(faults, rig, records[:2])
@@ -79,7 +82,7 @@ def test_records_of_late_and_early_triggers_are_named_and_brought_to_the_others_
 def test_a_delay_of_a_fraction_of_a_sample_is_one_too(rig):
     records = delayed(rig, 0.0, 2.5)
     (fault,) = setup_faults(rig, records)
-    assert fault.sentence.startswith("The record high is 2.5 samples late beside low")
+    assert fault.sentence.startswith("The outputs of record high are 2.5 samples late relative to those of record low")
     _, (_, again) = without_faults([fault], rig, records)
     true = measured(rig, "high", 1).outputs[:, : again.n_samples]
     error = (again.outputs - true)[:, 50:-50].std(axis=1) / true.std(axis=1)
@@ -90,7 +93,9 @@ def test_what_all_records_have_in_common_stays_for_the_effects(rig):
     assert setup_faults(rig, delayed(rig, 3.0, 3.0, 2.5)) == ()
     assert setup_faults(rig, delayed(rig, 3.0)) == ()
     faults = setup_faults(rig, delayed(rig, 2.0, 6.0, 2.0))
-    assert [fault.sentence.split(",")[0] for fault in faults] == ["The record high is 4 samples late beside low"]
+    assert [fault.sentence.split(" (")[0] for fault in faults] == [
+        "The outputs of record high are 4 samples late relative to those of record low"
+    ]
 
 
 def test_a_drive_that_is_late_delays_the_records_that_it_drives_and_is_no_trigger(rig):

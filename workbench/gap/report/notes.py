@@ -84,7 +84,7 @@ def _of_gap(verdict: Verdict) -> Iterator[str]:
             f" {10.0 * np.log10(where.distortions[i, j]):.0f} dB above the noise: a nonlinearity is present."
         )
     if verdict.attribution.reconstruction.has_several_rates:
-        yield "The records have several sample rates, so no random force was sought: bring them to one rate for that."
+        yield "The records have several sample rates, so no random force was searched for: resample them to one rate."
     if verdict.outcome == "unknown" and verdict.budget.is_mostly_unexplained and verdict.budget.errors:
         yield "Most of the gap is unexplained, so the fitted sizes of the model's errors are not meaningful."
 

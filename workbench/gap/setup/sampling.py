@@ -84,7 +84,7 @@ def modal_units(gap: Comparison) -> list[SetupFault]:
 
 
 def late_records(gaps: Sequence[Comparison]) -> list[SetupFault]:
-    """Faults of records that are late or early beside others that the same inputs drive, where the delays differ.
+    """Faults of records that are late or early relative to others that the same inputs drive, where the delays differ.
 
     A delay is one of all outputs, by which they agree best with the prediction; each of these records must show its
     own. Where the inputs differ, so may the delays of their actuators. gaps: each of one record.
@@ -124,8 +124,8 @@ def _late_among(gaps: Sequence[Comparison]) -> list[SetupFault]:
             how, remedy = ("late", "earlier") if late > 0 else ("early", "later")
             by = f"{abs(late):.3g} sample{'s' * (abs(late) != 1.0)}"
             sentence = (
-                f"The record {record.name} is {by} {how} beside {gaps[least].record_names[0]}, by its trigger: shift"
-                f" all its outputs {by} {remedy}."
+                f"The outputs of record {record.name} are {by} {how} relative to those of record"
+                f" {gaps[least].record_names[0]} (trigger offset): shift them all {by} {remedy}."
             )
             correction = partial(outputs_earlier, late)
             faults.append(SetupFault("late record", sentence, closes, correction, records=(record.name,)))
