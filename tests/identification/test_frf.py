@@ -435,7 +435,7 @@ def test_damping_that_hanns_window_makes_too_high_is_remarked():
     inside = (f > 4.0) & (f < 40.0)
     found = identify_frf(h[:, inside], f[inside], channels=(Channel("a", "displacement"), Channel("b")))
     assert (found.modes.zeta > 1.3 * 0.005).all()
-    assert any("of modes 1, 2: if these are averages by Hann's window" in remark for remark in found.remarks)
+    assert any("of modes 1, 2: if these are averages with a Hann window" in remark for remark in found.remarks)
 
 
 def test_a_band_that_ended_early_is_searched_in_the_time_that_others_leave(monkeypatch):

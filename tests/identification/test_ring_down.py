@@ -192,9 +192,9 @@ def test_mains_hum_is_asked_about_near_multiples_of_its_frequency(hertz, told):
 
 
 def test_modes_of_the_same_remark_share_a_line():
-    assert by_remark(["", "grows", "hardly rings: a drift?", "grows"]) == [
+    assert by_remark(["", "grows", "hardly oscillates: a drift?", "grows"]) == [
         "modes 2 and 4: grows",
-        "mode 3: hardly rings: a drift?",
+        "mode 3: hardly oscillates: a drift?",
     ]
 
 
@@ -271,7 +271,7 @@ def test_lost_samples_that_end_the_search_for_the_start_are_named(straight):
     last = outputs[1, 360] if straight else outputs[1, 299]
     outputs[1, 299:361] = np.linspace(outputs[1, 299], last, 62)
     told = ring_down(replace(record, outputs=outputs))
-    how = "runs straight for 62" if straight else "stays at one value for 62"
+    how = "is linear in time for 62" if straight else "stays at one value for 62"
     assert any(f"'y2' {how} samples from 5.98 s on: lost data? Only what follows" in note for note in told.notes)
     assert found_within_errors(told)
 

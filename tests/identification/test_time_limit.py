@@ -135,7 +135,7 @@ def test_what_is_damped_too_much_to_ring_is_no_driven_mode():
     found, (remark,) = _without_artefacts(data, SelectedModes(fit, np.ones(2), 1.0, False), TimeLimit())
     np.testing.assert_allclose(np.abs(fit.poles), omega, rtol=0.02)
     np.testing.assert_allclose(np.abs(found.fit.poles), omega[:1], rtol=1e-3)
-    assert "by more than 0.3" in remark and "poles at 19" in remark
+    assert "damping ratio above 0.3" in remark and "frequency): 19" in remark
 
 
 def test_the_strongest_modes_leave_time_for_the_check_of_those_that_change(monkeypatch):

@@ -130,7 +130,7 @@ def test_an_axis_of_unknown_name_is_no_reason_to_state_a_rate(tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda rows: rows[::-1], "its instants fall, from 0.059 to 0 s; sort the rows by time"),
+        (lambda rows: rows[::-1], "its instants decrease, from 0.059 to 0 s; sort the rows by time"),
         (
             lambda rows: [*rows[:30], rows[31], rows[30], *rows[32:]],
             "row 33 is 0.001 s before the one above; sort the rows",

@@ -87,7 +87,7 @@ def correlation_functions(
 
     Returns:
         One record per reference, with all outputs, for `stacked_delays`, `stabilise` or `refine` together. Their noise
-        is not white, so that standard errors of `refine` do not hold: use `identify_ambient` for these.
+        is not white, so that standard errors of `refine` are invalid: use `identify_ambient` for these.
 
     Raises:
         ValueError: an output that never moves; an unknown reference; a record shorter than forty times `max_lag`.

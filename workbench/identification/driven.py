@@ -217,8 +217,8 @@ def identify_driven(
         straight: former name of `input_hold="first"`; it warns.
 
     Returns:
-        `DrivenModes`. Its standard errors hold in noise of any smooth spectrum. They include white noise of the inputs,
-        which is detected where two or more modes show it, with a remark.
+        `DrivenModes`. Its standard errors are valid in noise of any smooth spectrum. They include white noise of the
+        inputs, which is detected where two or more modes show it, with a remark.
 
     Raises:
         ValueError: no inputs, inputs that never move or move alike; an output that never moves; records that differ;
@@ -359,8 +359,8 @@ def _without_artefacts(
         return selected, ()
     which = ", ".join(f"{f:.4g}" for f in sorted(out))
     remark = (
-        f"left out, as damped negatively or by more than {SELECTION.most_damped:g}, of unknown frequency or beyond"
-        f" Nyquist: poles at {which} Hz"
+        f"poles left out (negative damping, damping ratio above {SELECTION.most_damped:g}, undetermined frequency, or"
+        f" above the Nyquist frequency): {which} Hz"
     )
     return selected.refitted(fit), (remark,)
 

@@ -359,7 +359,7 @@ def _modes_of(
     within &= (damped_hz >= edges_hz[0]) & (damped_hz < edges_hz[1])
     inside = np.flatnonzero(within & sure)
     unsure = ", ".join(f"{f:.4g}" for f in damped_hz[within & ~sure])
-    left_out = [f"left out, as negatively damped or of unknown frequency: poles at {unsure} Hz"] if unsure else []
+    left_out = [f"poles left out (negative damping or undetermined frequency): {unsure} Hz"] if unsure else []
     derivative, poles = time_derivatives(channels)[:, None], fit.poles[inside]
     shapes, participation = scaled_vectors(fit, inside, derivative)
     vectors = vector_covariance(fit, noise_ratio, derivative, inside, lines.n_inputs)
@@ -456,7 +456,7 @@ def _scatter_remark(estimate: FrfModes) -> tuple[str, ...]:
     narrow = [str(r + 1) for r in np.flatnonzero((estimate.scatter_hz > 0) & (lines < FRF.resolved))]
     leaks = (
         f". Fewer than {FRF.resolved:g} lines lie in the half-power bandwidth of mode{'s' * (len(narrow) > 1)}"
-        f" {', '.join(narrow)}: if these are averages by Hann's window, its leakage makes that damping too high"
+        f" {', '.join(narrow)}: if these are averages with a Hann window, its leakage makes that damping too high"
     )
     return (
         f"frequencies scatter in the peaks of {', '.join(which)}: such a mode changes with time or amplitude, or a"

@@ -218,8 +218,8 @@ def _rigid_of_residual_term(
     above = identified.upper_residual[:, :, None] * (2.0 * np.pi * hz) ** order[:, :, None]
     if (share := np.linalg.norm(above) / np.linalg.norm(identified.fitted)) > RIGID_SHARE:
         warnings.warn(
-            f"modes above {hz[-1]:.4g} Hz make {100.0 * share:.0f} % of the response, and are left out of the rig;"
-            " identify up to a higher line",
+            f"modes above {hz[-1]:.4g} Hz contribute {100.0 * share:.0f} % of the response, and are left out of the"
+            " rig; identify up to a higher line",
             stacklevel=4,
         )
     below, error = identified.lower_residual, identified.lower_residual_std
@@ -235,8 +235,8 @@ def _rigid_of_residual_term(
         )
         return below, error, max(least, RIGID_SHARE * float(np.linalg.norm(below)))
     warnings.warn(
-        f"modes below the lowest line, {hz[0]:.4g} Hz, rigid or elastic, make {100.0 * share:.0f} % of the response"
-        " there, and are left out of the rig; identify from a lower line",
+        f"modes below the lowest line, {hz[0]:.4g} Hz, rigid or elastic, contribute {100.0 * share:.0f} % of the"
+        " response there, and are left out of the rig; identify from a lower line",
         stacklevel=4,
     )
     return None

@@ -476,7 +476,7 @@ def remarks(refined: RefinedModes, records: Record | Sequence[Record]) -> tuple[
             endless = "does not decay: mains hum?" if near_mains(f) else "does not decay within the record"
             texts.append(endless if lasts else WITHIN_ERROR)
         elif zeta > SELECTION.most_damped:
-            texts.append("hardly rings: a drift?")
+            texts.append("hardly oscillates: a drift?")
         else:
             texts.append("")
     return tuple(texts)

@@ -104,7 +104,7 @@ def _cause_and_remedy(time: np.ndarray, steps: np.ndarray, worst: int, row_of: C
     if not steps.any():
         return f"all its instants are equal, {time[0]:g} s; write the instants of its samples, or leave the column out"
     if (steps < 0).all():
-        return f"its instants fall, from {time[0]:g} to {time[-1]:g} s; sort the rows by time"
+        return f"its instants decrease, from {time[0]:g} to {time[-1]:g} s; sort the rows by time"
     if (steps < 0).any():
         row, count = int(np.argmax(steps < 0)), int((steps < 0).sum())
         remedy = "sort the rows by time" + (", or cut the record there if another begins" if count == 1 else "")

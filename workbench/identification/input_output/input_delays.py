@@ -48,7 +48,7 @@ DELAY_SEARCH = "search for delays of the inputs"
 FRACTIONS = np.linspace(0.0, 1.0, 401)  # of a sample
 HOLD_IN_WORDS = {
     "zero": "held between samples",
-    "first": "straight between samples",
+    "first": "linear between samples",
     "band-limited": "band-limited, as behind an anti-alias filter",
 }
 

@@ -227,7 +227,12 @@ class Bands(Printed):
         shares = self.std.max(axis=0) / largest, self.interpolation_std.max(axis=0) / largest
         each = enumerate(zip(*shares, self.width))
         rows = [(str(r + 1), f"{100 * std:.2g}", f"{100 * part:.2g}", f"{width:.2f}") for r, (std, part, width) in each]
-        headings = ("mode", "standard error [% of largest]", "of it by interpolation", "half width [standard errors]")
+        headings = (
+            "mode",
+            "standard error [% of largest]",
+            "interpolation part [% of largest]",
+            "half width [standard errors]",
+        )
         line = f"bands of {counted(len(rows), 'eigenfunction')} at {counted(len(self.x), 'place')}, {self.level:.0%}"
         return line, headings, rows, ()
 

@@ -38,7 +38,7 @@ class ModePairing(Printed):
         rows = [(str(r + 1), str(s + 1), f"{m:.4f}", f"{hz:.5g}") for r, s, m, hz in each]
         unpaired = ", ".join(str(r + 1) for r in self.others)
         remarks = (f"measured modes without a mode of the model: {unpaired}",) if unpaired else ()
-        headings = ("measured mode", "mode of the model", "MAC", "its frequency, scaled [Hz]")
+        headings = ("measured mode", "mode of the model", "MAC", "frequency of the model, scaled [Hz]")
         return f"{counted(len(rows), 'mode')} paired", headings, rows, remarks
 
 

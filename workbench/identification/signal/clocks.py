@@ -64,7 +64,7 @@ def shape_remarks(estimates: ShapeEstimates, names: Sequence[str], only: Sequenc
         which_modes = ("mode " if len(which) == 1 else "modes ") + ", ".join(str(r + 1) for r in which)
         return (
             f"{which_modes}: the shape is complex, up to {100 * far[which].max():.0f} % from the nearest real one:"
-            " sensors that are not on one clock, close modes, or damping that is not proportional",
+            " sensors not sampled simultaneously, close modes, or non-proportional damping",
         )
     j, seconds = late
     side = "late" if seconds > 0 else "early"

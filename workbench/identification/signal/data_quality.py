@@ -171,13 +171,13 @@ def dropouts(record: Record) -> tuple[tuple[str, float, int, str], ...]:
 
     Returns:
         for each, sorted by output and time: name of the output, time of the first sample in s, number of samples, and
-        "stays at one value" or "runs straight".
+        "stays at one value" or "is linear in time".
     """
     result = []
     for name, row in zip(record.output_names, record.outputs, strict=True):
         rounding, ends = DATA.straight * np.ptp(row), (row.min(), row.max())
         resolution, taken, lost = 0.0, np.zeros(row.size, bool), []
-        for order, how in ((1, "stays at one value"), (2, "runs straight")):
+        for order, how in ((1, "stays at one value"), (2, "is linear in time")):
             moves = np.abs(np.diff(row, order))
             still = np.flatnonzero(moves <= rounding)
             if still.size < DATA.fewest_equal - 1:

@@ -62,7 +62,7 @@ def harmonic_remarks(
     modes = ", ".join(mode_text(r, abs(poles[r]) / (2.0 * np.pi)) for r in steady)
     return (
         f"harmonic excitation? the motion about {modes} has a constant amplitude, or one line far above those beside"
-        " it, as mains hum and turning machines make it; then it is no mode, and its standard errors do not hold",
+        " it, as mains hum and turning machines make it; then it is no mode, and its standard errors are invalid",
     )
 
 

@@ -142,7 +142,7 @@ class Distributions(Printed):
         mass, stiffness = (counted(each.basis.n_terms, "term") for each in (self.mass, self.stiffness))
         line = (
             f"mass in {mass}, stiffness in {stiffness} from {counted(self.scales.size, 'mode')}, orthogonal to"
-            f" {self.orthogonality:.2g}"
+            f" within {self.orthogonality:.2g}"
         )
         rows = printed_rows(self.length, self.mass, self.stiffness)
         return line, ("x [m]", "mass [kg/m]", "±", "stiffness", "±"), rows, self.remarks
@@ -166,7 +166,7 @@ class Distributions(Printed):
                 )
         if self.orthogonality > RELIABLE:
             remarks.append(
-                f"two modes are orthogonal only to {self.orthogonality:.2g}, at most {RELIABLE:g} where mass and"
+                f"two modes are orthogonal only to within {self.orthogonality:.2g}, at most {RELIABLE:g} where mass and"
                 " shapes agree: the mass needs other terms, or something is attached that the relations do not contain,"
                 " as a point mass; use choose_structure with what is attached in the nominal structure"
             )
