@@ -16,7 +16,7 @@ InputHold = Annotated[
     typer.Option(
         metavar="HOLD",
         help="Intersample behaviour of the inputs: zero (held, as a command), band-limited (as a force measured behind"
-        " an anti-alias filter) or first (straight); as the file says unless given.",
+        " an anti-alias filter) or first (first-order hold, linear); as the file says unless given.",
     ),
 ]
 PagePath = Annotated[Path | None, typer.Option("--page", help="HTML file to write; default out/NAME.html.")]
@@ -33,7 +33,8 @@ ImpulseAt = Annotated[
     str | None,
     typer.Option(
         metavar="PLACE",
-        help="Place of the impulse: m (X,Y on a plate), a point or an input by name; the hammer's unless given.",
+        help="Place of the impulse: m (X,Y on a plate), a point or an input by name; unless given, that of"
+        " the input of kind hammer.",
     ),
 ]
 Weight = Annotated[

@@ -36,7 +36,7 @@ def predict(
     json_path: options.JsonPath = None,
     page: options.PagePath = None,
 ) -> None:
-    """Predict the readings of a test to come, with bands that hold 95 % of them over time and by frequency.
+    """Predict the readings of a test to come, with bands that contain 95 % of them over time and by frequency.
 
     Example: workbench predict cases/arm planned.csv --verdict verdict.json
     """

@@ -20,7 +20,7 @@ from workbench.rig.rig import Rig
 def with_intervals(
     rig: Rig, found: Fit, data: FitData, workers: Workers = ALONE, *, wide: bool = False, logged: float = 0.0
 ) -> Fit:
-    """The fit with standard errors whose 95 % intervals hold although the residual is not white.
+    """The fit with standard errors whose 95 % intervals are valid although the residual is not white.
 
     With J the sensitivities, r the residual in units of the noise, and P the precision of the priors,
 
