@@ -141,5 +141,5 @@ def plot_controlled_mode_count(found: dict[str, ControlledModeCount], share: flo
             ax.axvline(result.recommended, color=COLOURS[2], linewidth=6, alpha=0.35, label=label)
         ax.set(xlabel="controlled modes, n", xticks=result.counts, title=name)
         ax.legend()
-    axes[0, 0].set_ylabel("remaining share of the disturbance's energy")
+    axes[0, 0].set_ylabel("remaining share of the disturbance's energy [-]")
     return figure
