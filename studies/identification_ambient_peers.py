@@ -251,12 +251,12 @@ def study(outcome, data: Path | None = None) -> None:
         for name, row in table.items():
             outcome.say(
                 f"{level} dB, {name}: worst mode {row['median']:.2f} (median; {row['median_of_found']:.2f} of those"
-                f" found), {row['missed']} missed of {row['modes']}, {row['false']} false"
+                f" found), {row['missed']} missed of {row['modes']}, {row['false']} spurious"
             )
     if SSI in names:
-        for what in ("missed", "false"):
+        for what, word in (("missed", "missed"), ("false", "spurious")):
             ours, peers = (sum(table[name][what] for table in tables.values()) for name in (OURS, SSI))
-            outcome.check(f"{what} modes, less those of SSI-cov", ours - peers, -1)
+            outcome.check(f"{word} modes, less those of SSI-cov", ours - peers, -1)
         for level, table in tables.items():
             ratio, of_found = (table[OURS][what] / table[SSI][what] for what in ("median", "median_of_found"))
             outcome.say(f"{level} dB: median worst mode over SSI-cov's {ratio:.2f}; {of_found:.2f} of those found")

@@ -226,8 +226,8 @@ def study(outcome, data: Path | None = None) -> None:
         nearest = min(peers, key=lambda name: peers[name]["median"])
         outcome.say(
             f"{level} dB: worst mode {ours['median']:.2f} standard errors of the bound (an efficient method"
-            f" {efficient[level]:.2f}), {ours['missed']} missed, {ours['false']} false; next {nearest} with"
-            f" {peers[nearest]['median']:.2f}, {peers[nearest]['missed']} missed, {peers[nearest]['false']} false"
+            f" {efficient[level]:.2f}), {ours['missed']} missed, {ours['false']} spurious; next {nearest} with"
+            f" {peers[nearest]['median']:.2f}, {peers[nearest]['missed']} missed, {peers[nearest]['false']} spurious"
         )
         outcome.check(
             f"{level} dB: worst mode over that of an efficient method", ours["median"] / efficient[level], 1.1
