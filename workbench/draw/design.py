@@ -76,7 +76,7 @@ def plot_work(spillovers: dict[str, Spillover]) -> Figure:
     ax.set(xlabel="residual mode", ylabel="spillover work W_r [J]", xticks=few_ticks(modes))
     # room above the bars for the legend
     ax.set_ylim(3.0 * lowest if signed else least, 10.0 ** (1.0 + 0.35 * len(spillovers)) * total)
-    ax.set_title("control spillover: energy that control leaves in the residual modes")
+    ax.set_title("control spillover: work of the actuators on each residual mode")
     ax.legend(loc="upper right")
     return figure
 
