@@ -234,6 +234,6 @@ def _plot_place(places, shares, lowest):
     figure, ax = new_figure(1, 1, width=8, height=3.4)
     ax.plot(1e3 * places, shares, "o-", color=COLOURS[0])
     ax.axvspan(1e3 * lowest, 1e3 * places[-1], color=COLOURS[2], alpha=0.2, label="not excluded (95 %)")
-    ax.set(xlabel="distance of the mass from the clamp [mm]", ylabel="residual power / least [-]")
+    ax.set(xlabel="distance of the mass from the clamp [mm]", ylabel="residual power / minimum [-]")
     ax.legend()
     return figure

@@ -152,7 +152,7 @@ def table_4_1(outcome, exact, records, default) -> None:
             outcome.check(f"Table 4.1, m = {m}: largest error of {what} over the table's", (mine / theirs).max(), 1.0)
             errors[m, what] = (theirs, mine, relative_errors(default[m], exact, what))
     missed = max(abs(f.n_modes - exact.n_modes) for f in default.values())
-    outcome.check("Table 4.1, no order given: modes missed, or false", missed, 0)
+    outcome.check("Table 4.1, no order given: modes missed, or spurious", missed, 0)
     worst = max(relative_errors(f, exact, what).max() for f in default.values() for what in ("omega", "zeta"))
     outcome.check("Table 4.1, no order given: worst relative error of omega and zeta", worst, 1e-9)
     outcome.say(

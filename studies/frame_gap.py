@@ -123,8 +123,8 @@ def study(outcome, data=None):
         "joint",
         plot_joint(at, lines, effect, loop),
         "Left, the frame with its two shakers and six accelerometers, the real brace, and between which floors the"
-        " diagnosis found it: along x all points of a floor move as one. Right, the force of the real joint over its"
-        " stretch, where the high record has the largest, and the law that was found.",
+        " diagnosis found it: along x all points of a floor move as one. Right, the force of the real joint over the"
+        " relative displacement across it, where the high record has the largest, and the law that was found.",
     )
     outcome.figure(
         "responses",
@@ -134,7 +134,7 @@ def study(outcome, data=None):
 
 
 def plot_joint(at, lines, effect, loop):
-    """The frame with the joint in it, and the force of the joint over its stretch about the largest one."""
+    """The frame with the joint in it, and the force of the joint over the displacement across it, about the largest."""
     figure, (left, right) = new_figure(1, 2, width=9.5, height=5, gridspec_kw={"width_ratios": (4, 5)})
     _frame_with_joint(left, at | {"L0": (0.0, 0.0), "R0": (WIDTH, 0.0)}, lines, effect)
     values = effect.values
@@ -153,7 +153,7 @@ def plot_joint(at, lines, effect, loop):
     label = f"identified: slips at {slip:.3g} N,\nstiffness {values['stiffness']:.4g} N/m"
     right.text(0.02, 0.98, label, transform=right.transAxes, va="top")
     low, high = 1.15 * min(real.min(), -slip), 1.5 * slip
-    right.set(xlabel="stretch of the joint [mm]", ylabel="force of the joint [N]", ylim=(low, high))
+    right.set(xlabel="relative displacement across the joint [mm]", ylabel="force of the joint [N]", ylim=(low, high))
     right.set_title(f"the law found is the real one: {2 * SHOWN * DT:g} s of the high record")
     right.legend(loc="lower right")
     return figure

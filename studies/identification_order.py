@@ -70,13 +70,13 @@ def compared(seed: int) -> dict:
 
 
 def order_found(rows):
-    """Modes identified, missed and falsely reported over the signal-to-noise ratio; rows as `identification_order`."""
+    """Modes identified, missed and spurious over the signal-to-noise ratio; rows as `identification_order`."""
     figure, ax = new_figure(width=8, height=4.2)
     level = np.array([row["level_db"] for row in rows])
     kinds = (
         ([row["found"] for row in rows], "identified", "o", COLOURS[0]),
         ([row["count"] - row["found"] for row in rows], "missed", "x", COLOURS[1]),
-        ([row["false"] for row in rows], "false", "+", COLOURS[3]),
+        ([row["false"] for row in rows], "spurious", "+", COLOURS[3]),
     )
     totals = []
     for values, label, marker, colour in kinds:

@@ -56,14 +56,18 @@ def study(outcome, data=None):
             round(best.index, 4) / PUBLISHED[pairs],
             1.0 + 1e-9,
         )
-        outcome.check(f"{pairs} pair{'s' * (pairs > 1)}: gap of the certificate", best.gap, PROVEN[pairs] * (1 + 1e-9))
+        outcome.check(
+            f"{pairs} pair{'s' * (pairs > 1)}: certified optimality gap", best.gap, PROVEN[pairs] * (1 + 1e-9)
+        )
         outcome.say(
             f"{pairs} pair{'s' * (pairs > 1)}: E = {best.index:.5f} (published {PUBLISHED[pairs]}), middles at"
             f" {', '.join(f'{1000 * x:.1f}' for x in best.positions)} mm; no placement of them is better by more than"
             f" {best.gap:.0%}, proven on {best.cells} cells"
         )
     own = place_pairs(task(0.4 * np.eye(2)))
-    outcome.say(f"two pairs that each feed back their own rate alone leave E = {own.index:.5f}, and cannot destabilise")
+    outcome.say(
+        f"two pairs under decentralised rate feedback leave E = {own.index:.5f}; this loop is unconditionally stable"
+    )
     outcome.check(
         "two pairs, decentralised gains: E over that with the published gains", own.index / found[2].index, 1.0
     )

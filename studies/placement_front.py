@@ -111,7 +111,7 @@ def study(outcome, data=None):
             }
         )
         under = ", under every limit" if more else ""
-        outcome.check(f"{n} actuators{under}: gap of the certificate", proof.gap, gap * (1 + 1e-9))
+        outcome.check(f"{n} actuators{under}: certified optimality gap", proof.gap, gap * (1 + 1e-9))
         outcome.say(
             f"{n} actuator(s){under}: no placement has less than {1 - proof.gap:.0%} of the least W_R found, by"
             f" {proof.cells} cells of branch and bound; at the nodes of mode {n + 1} it is"

@@ -93,10 +93,10 @@ def placement_on_shapes(modes, placements, *, n_controlled):
         right.bar(at, np.maximum(work, LEAST_WORK), width, color=colour, label=label)
         for x in at[work < LEAST_WORK]:
             right.text(x, 1.3 * LEAST_WORK, "≈ 0", ha="center", fontsize=8, color=colour)
-    left.set(xlabel="x / length [-]", ylabel="mode shape, mass 1 [-]; triangles: actuators")
+    left.set(xlabel="x / length [-]", ylabel="mass-normalised mode shape [-]; triangles: actuators")
     left.legend(loc="upper center", ncols=2)
     right.set(yscale="log", ylim=(LEAST_WORK, None), xticks=number, xlabel="residual mode")
-    right.set_ylabel("spillover work W_r [-], length and mass 1")
+    right.set_ylabel("spillover work W_r [-], for unit length and unit mass")
     right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0))
     return figure
 

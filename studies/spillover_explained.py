@@ -23,22 +23,22 @@ ACTUATORS = (Actuator("F1", 10.0 / 6.0), Actuator("F2", 10.0 / 2.3))
 BESIDE, ACROSS = 10.0 / 6.0, 50.0 / 6.0
 
 
-def margins_of_filter(modes, way, actuators, count=24):
+def decay_rate_of_filter(modes, way, actuators, count=24):
     places = modes.length * np.arange(1, count + 1) / (count + 1)
     return close_with(modes, way(actuators, places)).decay_rate
 
 
-def plot_sensor_counts(margins, counts):
+def plot_sensor_counts(decay_rates, counts):
     """Decay rate of the full plant against the number of sensors, one line an estimator."""
     figure, ax = new_figure(width=9, height=4.5)
-    for (name, values), colour, mark in zip(margins.items(), COLOURS, "osD", strict=False):
+    for (name, values), colour, mark in zip(decay_rates.items(), COLOURS, "osD", strict=False):
         numbers = np.arange(1, len(values) + 1)
         there = np.isfinite(values)
         count = counts[name]
         label = f"{name}: stable from {count} sensors on" if count else f"{name}: unstable up to {len(values)}"
         ax.plot(numbers[there], values[there], mark + "-", color=colour, label=label, markersize=4)
     ax.axhline(0.0, color=GREY, linewidth=1.0)
-    largest = max(v[np.isfinite(v)].max() for v in margins.values())
+    largest = max(v[np.isfinite(v)].max() for v in decay_rates.values())
     ax.set_yscale("symlog", linthresh=max(largest, 1e-6))
     ax.set(xlabel="number of sensors, evenly spaced", ylabel="decay rate, −max Re λ [1/s]; below zero unstable")
     ax.set_title("observation spillover: decay rate of the full plant against the number of sensors")
@@ -79,14 +79,18 @@ def study(outcome, data=None):
 
     one = ACTUATORS[:1]
     stable, unstable = (explain_spillover(modes, observed(one, [place])) for place in (BESIDE, ACROSS))
-    outcome.check("margin on the reduced model, sensor across", reduced(observed(one, [ACROSS])), 0.01, at_least=True)
-    outcome.check("margin on the full model, sensor beside the actuator", stable.decay_rate, 0.0, at_least=True)
-    outcome.check("margin on the full model, sensor across", unstable.decay_rate, 0.0)
+    outcome.check(
+        "decay rate on the reduced model, sensor across, 1/s", reduced(observed(one, [ACROSS])), 0.01, at_least=True
+    )
+    outcome.check(
+        "decay rate on the full model, sensor beside the actuator, 1/s", stable.decay_rate, 0.0, at_least=True
+    )
+    outcome.check("decay rate on the full model, sensor across, 1/s", unstable.decay_rate, 0.0)
     worst = unstable.destabilising
     outcome.say(
-        f"one sensor at x = {BESIDE:.2f}, beside the actuator: stable, margin {stable.decay_rate:.2g} 1/s; at"
-        f" {ACROSS:.2f}: mode {worst.mode + 1} grows at {worst.closed_pole.real:.2g} 1/s, though the reduced model's"
-        f" margin is {reduced(observed(one, [ACROSS])):.2g}"
+        f"one sensor at x = {BESIDE:.2f}, beside the actuator: stable, decay rate {stable.decay_rate:.2g} 1/s; at"
+        f" {ACROSS:.2f}: mode {worst.mode + 1} grows at {worst.closed_pole.real:.2g} 1/s, though the reduced model"
+        f" has a decay rate of {reduced(observed(one, [ACROSS])):.2g} 1/s"
     )
 
     # two actuators and two sensors: by which path?
@@ -106,15 +110,17 @@ def study(outcome, data=None):
 
     found = spillover_remedies(modes, observed, one, [ACROSS])
     for remedy in found:
-        outcome.say(f"stabilised by: {remedy.change}; margin then {remedy.decay_rate:.2g} 1/s")
+        outcome.say(f"stabilised by: {remedy.change}; decay rate then {remedy.decay_rate:.2g} 1/s")
     checked = [explain_spillover(modes, remedy.controller).decay_rate for remedy in found]
-    outcome.check("every remedy, recomputed on the full plant: least margin", min(checked), 0.0, at_least=True)
+    outcome.check(
+        "every remedy, recomputed on the full plant: minimum decay rate, 1/s", min(checked), 0.0, at_least=True
+    )
     outcome.check("kinds of remedy found", len(found), 4, at_least=True)
 
     ways = {"Luenberger observer": observed, "Kalman filter": estimated, "modal filter": through_filter}
-    counts, margins = {}, {}
+    counts, decay_rates = {}, {}
     for name, way in ways.items():
-        counts[name], margins[name] = sufficient_sensors(modes, way, one, max_sensors=24)
+        counts[name], decay_rates[name] = sufficient_sensors(modes, way, one, max_sensors=24)
         outcome.say(f"{name}: {counts[name] or 'no number up to 24 of'} evenly spaced sensors suffice")
     outcome.say(
         "k evenly spaced sensors alias mode 2(k + 1) - r onto mode r, so the loop with a filter of displacements alone"
@@ -123,8 +129,8 @@ def study(outcome, data=None):
     perfect = close_loop(modes, law(one)).decay_rate
     outcome.check("number of sensors that suffices for the modal filter", counts["modal filter"] or np.inf, 24)
     outcome.check(
-        "its margin with 24 sensors over that with exact modal coordinates",
-        margins_of_filter(modes, through_filter, one) / perfect,
+        "its decay rate with 24 sensors over that with exact modal coordinates",
+        decay_rate_of_filter(modes, through_filter, one) / perfect,
         0.99,
         at_least=True,
     )
@@ -133,7 +139,7 @@ def study(outcome, data=None):
         [
             {
                 "sensor": place,
-                "margin": e.decay_rate,
+                "decay_rate": e.decay_rate,
                 "mode": e.shifts[0].mode + 1,
                 "shift": e.shifts[0].shift.real,
                 "first_order": e.shifts[0].first_order.real,
@@ -146,7 +152,7 @@ def study(outcome, data=None):
         [{"actuator": p.actuator, "sensor": p.sensor_at, "growth": p.shift.real} for p in worst.paths],
     )
     outcome.table(
-        "remedies", [{"kind": r.kind, "change": r.change, "size": r.size, "margin": r.decay_rate} for r in found]
+        "remedies", [{"kind": r.kind, "change": r.change, "size": r.size, "decay_rate": r.decay_rate} for r in found]
     )
     outcome.table("sufficient_sensors", counts)
     outcome.figure(
@@ -155,5 +161,5 @@ def study(outcome, data=None):
         "How fast each residual mode grows or decays under control, and the paths that make it.",
     )
     outcome.figure(
-        "cure", plot_sensor_counts(margins, counts), "Decay rate of the full plant against the number of sensors."
+        "cure", plot_sensor_counts(decay_rates, counts), "Decay rate of the full plant against the number of sensors."
     )

@@ -74,7 +74,7 @@ ROWS = {
     "W_R of the optimum / the best of a full grid": lambda r: _largest(r, "W_R of the optimum over the best"),
     "IMSC of a hundred thousand modes": lambda r: r["speeds"]["imsc_100000_modes_s"],
     "spillover explained": lambda r: _largest(r, "paths add up"),
-    "placement of 4 actuators": lambda r: _largest(r, "4 actuators", "certificate"),
+    "placement of 4 actuators": lambda r: _largest(r, "4 actuators", "certifi"),
     "frequencies re-identified": lambda r: _largest(r, "re-identified in the loop"),
     "ruler": lambda r: _largest(r, "MAC with the free-free beam"),
     "Silverbox": lambda r: 1e3 * r["rmse"]["multisines"]["after"],

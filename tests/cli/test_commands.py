@@ -156,7 +156,7 @@ def test_identify_reads_frfs(tmp_path):
     one = run("identify", path, "--outputs", "H 2", "--band-hz", 5, 12, "--json", found)
     assert one.exit_code == 0 and len(json.loads(found.read_text())["frequencies_hz"]) == 1
     few = run("identify", path, "--modes", 1)
-    assert few.exit_code == 0 and "the search reached its limit of modes" in " ".join(few.output.split())
+    assert few.exit_code == 0 and "the search reached its limit on the number of modes" in " ".join(few.output.split())
     for options, said in (
         (("--start", 1.0), "leave --start and --ambient out"),
         (("--inputs", "a"), "name no inputs"),
@@ -395,7 +395,7 @@ def test_laws_on_a_plate_are_compared_through_a_filter_and_an_observer(plate, tm
     through = json.loads(found.read_text())["through_sensors"]
     ways = ("through a modal filter", "on a Luenberger observer")
     assert [row["design"] for row in through] == [f"{law} {way}" for law in ("IMSC", "coupled LQR") for way in ways]
-    assert all(row["margin"] == pytest.approx(-max(row["poles_real"])) for row in through)
+    assert all(row["decay_rate"] == pytest.approx(-max(row["poles_real"])) for row in through)
 
 
 def test_patches_on_a_plate_are_placed_and_designed(plate, tmp_path):

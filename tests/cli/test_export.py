@@ -43,7 +43,7 @@ def test_a_controller_of_a_case_is_written(run, rig, tmp_path, estimator):
     result = run("export", rig, "--rate-hz", 100, "--estimator", estimator, "--to", tmp_path / "one.py")
     assert result.exit_code == 0, result.output
     assert "phase lag" in result.output and "decay rate" in result.output
-    assert "not read, as accelerations: a1" in result.output
+    assert "not used (accelerations): a1" in result.output
     one = runpy.run_path(str(tmp_path / "one.py"))["Controller"]()
     assert [one.step([1.0]), one.step([0.0])] != [[0.0], [0.0]]
 

@@ -16,6 +16,7 @@ def test_a_plate_is_a_net_that_moves_up_and_down_as_its_modes():
     plate = Plate(length=(2.0, 1.0), mass_per_area=1.0, bending_stiffness=1.0, poisson_ratio=0.3, edges="clamped")
     modes = plate.modes(2)
     shown = mode_motion({"nominal": modes}, actuators=[Actuator("F", (1.0, 0.0))])
+    assert shown["unit"] == "Hz" and mode_motion({"nominal": modes}, frequency="1/ms")["unit"] == "1/ms"
     rest, moves = np.array(shown["net"]["rest"]), np.array(shown["tracks"][0]["moves"])
     assert moves.shape == (2, len(rest), 2) and (moves[..., 0] == 0).all()
     # what lies at the front is seen where it is, and the back rises to the right
@@ -36,6 +37,7 @@ def test_a_plate_moves_as_its_modal_coordinates_say_both_responses_in_one_scale(
         "new": Response(time, modal, np.zeros((1, 21)), modes),
     }
     shown = response_motion(both, actuators=[Actuator("F", (1.0, 0.0))])
+    assert shown["unit"] == "s" and response_motion(both, time="ms")["unit"] == "ms"
     present, new = (np.einsum("rij,rt->tij", np.array(t["moves"]), np.array(t["modal"])) for t in shown["tracks"])
     assert np.abs(present).max() == pytest.approx(SWAY * 2.4, rel=1e-3)
     np.testing.assert_allclose(new, 0.5 * present, atol=1e-4)

@@ -20,6 +20,7 @@ from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError
 from workbench.design.loop.closed_loop import close_loop, close_with, impulse_state
 from workbench.design.spillover.spillover import effort, finite_spillover
+from workbench.records.units import Units
 from workbench.rig.actuators import Actuator, piezo_patch
 from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import NamedPoints
@@ -96,6 +97,8 @@ def test_labels_have_the_units_of_the_rig(tmp_path):
     rig, _, units = read_structure(tmp_path)
     labels = setting(rig, units)["labels"]
     assert labels["residual"] == "spillover work W_R [N mm]" and labels["forces"] == "moment [N mm/mm]"
+    per_ms = setting(RIG, Units(time="ms"))["labels"]
+    assert (per_ms["clock"], per_ms["rate"], labels["clock"], labels["rate"]) == ("ms", "1/ms", "s", "1/s")
 
 
 def plain(design) -> dict:

@@ -143,7 +143,7 @@ def test_a_design_says_which_loops_are_unstable(tmp_path):
     ],
 )
 def test_what_is_said_of_the_stability_of_all_loops_is_true(tmp_path, words, said):
-    sensed = [{"design": name, "margin": 0.0, "stable": True, "robustness": None, "stability": word}
+    sensed = [{"design": name, "decay_rate": 0.0, "stable": True, "robustness": None, "stability": word}
               for name, word in zip(("first", "second"), words, strict=True)]  # fmt: skip
     shown = page_content_in(written(tmp_path, {**DESIGNED, "through_sensors": sensed}))
     assert shown.lead.startswith(said) and [row[2] for row in shown.tables[1][2]] == list(words)

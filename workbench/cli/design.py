@@ -127,7 +127,7 @@ def _sensed(
     row = [name, {"stable": rate, "unstable": f"{rate} unstable"}.get(stability, stability), limiting, path]
     return row + ([] if share is None else [str(round(share * count))]), {
         "design": name,
-        "margin": explained.decay_rate,  # the key of earlier files
+        "decay_rate": explained.decay_rate,
         "stable": not explained.loop.unstable_poles.size,
         "stability": stability,
         "limited_by": limiting,

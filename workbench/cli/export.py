@@ -53,5 +53,5 @@ def export(
     print_result(design)
     say(f"  {damping_by(found.modes, chosen)}")
     if unread:
-        say(f"  not read, as accelerations: {', '.join(unread)}")
+        say(f"  not used (accelerations): {', '.join(unread)}")
     say(f"  written to {short(to)}" + (f" and {short(to.with_suffix('.h'))}" if to.suffix == ".c" else ""))

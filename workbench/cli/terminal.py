@@ -26,7 +26,7 @@ OPTIONS = {  # by argument, or by its words in a message, a regular expression
     r"input_hold(?= is zero \(held\))": "--input-hold",  # not the key of a case file
     "(?<=raise )the limit of effort": "--effort-ratio",
     "the limit of peak force": "--peak-force",
-    "the limit of condition": "--condition",
+    "the limit of the condition number": "--condition",
     "(?<=lower )the spacing": "--spacing",
     "the control weight R": "--weight",
     "the relative error of the models": "--errors",

@@ -76,7 +76,7 @@ def plot_work(spillovers: dict[str, Spillover]) -> Figure:
     ax.set(xlabel="residual mode", ylabel="spillover work W_r [J]", xticks=few_ticks(modes))
     # room above the bars for the legend
     ax.set_ylim(3.0 * lowest if signed else least, 10.0 ** (1.0 + 0.35 * len(spillovers)) * total)
-    ax.set_title("control spillover: energy that control leaves in the residual modes")
+    ax.set_title("control spillover: work of the actuators on each residual mode")
     ax.legend(loc="upper right")
     return figure
 
@@ -141,5 +141,5 @@ def plot_controlled_mode_count(found: dict[str, ControlledModeCount], share: flo
             ax.axvline(result.recommended, color=COLOURS[2], linewidth=6, alpha=0.35, label=label)
         ax.set(xlabel="controlled modes, n", xticks=result.counts, title=name)
         ax.legend()
-    axes[0, 0].set_ylabel("remaining share of the disturbance's energy")
+    axes[0, 0].set_ylabel("remaining share of the disturbance's energy [-]")
     return figure

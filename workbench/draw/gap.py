@@ -65,7 +65,7 @@ def plot_gaps(gap: Mapping[str, Mapping[str, float]]) -> Figure:
         ax.bar(np.arange(len(records)) + 0.27 * (i - 1), values, 0.27, color=colour, label=name)
     ax.set_xticks(np.arange(len(records)), records)
     ax.set_xlim(-1.0, max(len(records), 3) - 0.5)
-    ax.set(yscale="log", xlabel="record", ylabel="rms error / rms signal", title="gap on the validation records")
+    ax.set(yscale="log", xlabel="record", ylabel="rms error / rms signal [-]", title="gap on the validation records")
     ax.legend()
     return figure
 

@@ -57,7 +57,7 @@ def plot_standard_errors(refined: RefinedModes) -> Figure:
     axes[0].semilogy(modes, refined.omega_std / refined.modes.omega, "o-")
     axes[1].semilogy(modes, refined.zeta_std / np.maximum(np.abs(refined.modes.zeta), 1e-300), "o-")
     for ax, title in zip(axes, ("frequency", "damping ratio")):
-        ax.set(title=title, ylabel="relative standard error")
+        ax.set(title=title, ylabel="relative standard error [-]")
     axes[1].set(xlabel="mode", xticks=few_ticks(modes))
     return figure
 
@@ -145,7 +145,7 @@ def peers_errors(
             time = "" if row == 0 else f", {ratio:.2g} × time of this package"
             look = {"fontsize": 8.5, "color": GREY if missed + false == 0 else "black"}
             place = {"ha": "right", "va": "center", "transform": ax.get_yaxis_transform()}
-            ax.text(0.99, row - 0.38, f"{missed} missed, {false} false{time}", **look, **place)
+            ax.text(0.99, row - 0.38, f"{missed} missed, {false} spurious{time}", **look, **place)
         ax.axvline(efficient[level], color=GREY, lw=3, alpha=0.5, zorder=0)
         ax.set(xscale="log", xlabel="error of the worst mode\n/ Cramér-Rao standard deviation [-]")
         ax.set_title(f"signal-to-noise ratio {level} dB")

@@ -31,13 +31,14 @@ def response_motion(
     sensors: Sequence[Sensor] = (),
     colours: Mapping[str, str] | None = None,
     length: str = "m",
+    time: str = "s",
 ) -> dict[str, Any]:
     """An animation of responses of one structure, superposed along a beam, side by side for plates and frames.
 
     Args:
         responses: by the displayed name; all with the same time axis and number of modes.
         colours: of responses by name; None for the first of several in grey.
-        length: the unit of x.
+        length, time: the units of x and of the time axis.
     Raises:
         ValueError: different time axes, or named points without positions.
     """
@@ -50,7 +51,8 @@ def response_motion(
         {"label": name, "modal": _numbers(q), "colour": (colours or {}).get(name)}
         for name, q in zip(responses, modal, strict=True)
     ]
-    shown = {"kind": "response", "time": _numbers(first.time[::step]), "seconds": SHOWN_SECONDS, "tracks": tracks}
+    instants = {"time": _numbers(first.time[::step]), "unit": time}
+    shown = {"kind": "response", **instants, "seconds": SHOWN_SECONDS, "tracks": tracks}
     if isinstance(first.modes.domain, Interval):
         x = np.linspace(0.0, first.modes.length, N_PLACES)
         for track, response in zip(tracks, responses.values(), strict=True):
@@ -71,6 +73,7 @@ def mode_motion(
     actuators: Sequence[Actuator] = (),
     sensors: Sequence[Sensor] = (),
     std: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
+    frequency: str = "Hz",
 ) -> dict[str, Any]:
     """An animation of mode shapes, one mode at a time; several sets of modes are superposed, each scaled to one.
 
@@ -81,6 +84,7 @@ def mode_motion(
         modes: by the displayed name.
         std: standard errors (n_modes,) of the frequencies, Hz, and of the damping ratios of a set of modes; both are
             displayed to the second digit of their error.
+        frequency: the unit of the frequencies.
 
     Raises:
         ValueError: modes at named points without positions.
@@ -95,7 +99,7 @@ def mode_motion(
     for track in shown["tracks"]:
         for key, errors in zip(("frequencies_hz", "damping"), (std or {}).get(track["label"], ()), strict=False):
             track[key] = [_to_error(*pair) for pair in zip(track[key], np.asarray(errors).tolist(), strict=True)]
-    return shown
+    return shown | {"unit": frequency}
 
 
 def _to_error(value: float, error: float) -> float:

@@ -33,7 +33,7 @@ def plot_redesign(result: Redesign) -> Figure:
         left.semilogy(time, middle, color=colour, linewidth=1.2, label=label)
     left.axhline(SETTLED, color=GREY, linewidth=0.8)
     left.annotate("settling threshold", (time[-1], SETTLED), (0, 3), textcoords="offset points", fontsize=8, ha="right")
-    left.set(xlabel=f"time [{result.units.time}]", ylabel="modal energy over its peak", ylim=(1e-6, 3.0))
+    left.set(xlabel=f"time [{result.units.time}]", ylabel="modal energy / peak energy [-]", ylim=(1e-6, 3.0))
     left.set_title(f"{result.verification.n_draws} samples of the uncertain model: median and 95 % interval")
     left.legend(fontsize=8)
     rows = np.arange(len(result.controlled))

@@ -140,7 +140,7 @@ def _coherence(ax: Axes, record: Record) -> None:
     for (channel, row), dashes in zip(zip(record.output_channels, record.outputs, strict=True), DASHES, strict=False):
         lines, found = coherence(u, row - row.mean(), rate, nperseg=segment)
         ax.plot(lines[1:], found[1:], linewidth=0.9, linestyle=dashes, label=channel.name)
-    ax.set(xlabel="frequency [Hz]", ylabel="coherence", ylim=(0.0, 1.05))
+    ax.set(xlabel="frequency [Hz]", ylabel="coherence [-]", ylim=(0.0, 1.05))
 
 
 def plot_frf(record: Record) -> Figure:

@@ -155,17 +155,17 @@ def identify_frf(
 
     Args:
         frf: (n_outputs, n_frequencies), or (n_outputs, n_references, n_frequencies), complex, outputs per unit
-            input, for e^(iωt); those for e^(-iωt) are recognised at evenly spaced lines, and remarked. Receptance,
+            input, for e^(iωt); those for e^(-iωt) are recognised at evenly spaced lines, with a remark. Receptance,
             mobility or accelerance by the quantity of each channel.
         frequencies_hz: (n_frequencies,) increasing, at any spacing.
         channels: one per output; where no quantity is stated, the residual terms are those of any motion.
         band_hz: lowest and highest line to fit; modes outside the band are represented by residual terms.
         noise_std: standard error of real and imaginary part, one or of the shape of `frf`: from repeated
             measurements, or by `coherence_noise`. It sets the relative weights of the lines; its overall level is
-            estimated from the residual, and remarked where that disagrees. Without it, noise is taken to be the same at
-            all lines of an output, or, where neighbouring lines show it, to depend on reference, frequency and modulus
-            of the lines (`relative_noise`). Standard errors then increase with the residual about each mode where that
-            is larger than elsewhere.
+            estimated from the residual, with a remark where that disagrees. Without it, noise is taken to be the same
+            at all lines of an output, or, where neighbouring lines show it, to depend on reference, frequency and
+            modulus of the lines (`relative_noise`). Standard errors then increase with the residual about each mode
+            where that is larger than elsewhere.
         max_modes: largest number of modes of a band.
         false_alarm: probability that noise alone is taken for a mode; 0.001 unless given.
         seconds: of processor time, 30 unless given, after which the best so far is returned, with a remark; None for no

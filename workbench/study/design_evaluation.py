@@ -212,7 +212,7 @@ def _instability(modes: Modes, law: Law, through: ModalFilter | None, fastest: f
     if growing:
         found += f": residual mode{'s' * (len(growing) > 1)} {joined_in_words(growing)} grow{'s' * (len(growing) == 1)}"
     rate = explained.reduced_decay_rate
-    alone = "stable" if rate > 0.0 else f"not stable either, of decay rate {rate:.3g} 1/s"
+    alone = "stable" if rate > 0.0 else f"unstable too (decay rate {rate:.3g} 1/s)"
     return f"{found}; without residual modes it is {alone}; move or add sensors, or raise R"
 
 
@@ -252,7 +252,7 @@ def setting(rig: Rig, units: Units = SI) -> dict[str, Any]:
         "residual": "spillover work W_R [J]", "by_mode": "spillover work W_r [J]", "energy": "energy of all modes [J]",
         "effort": effort, "peak_force": peak, "forces": peak.removeprefix("peak "), "time": "time [s]",
         "final_time": "final time [s]", "real": "real part [rad/s]", "imaginary": "imaginary part [rad/s]",
-        "rate": "rad/s", "x": "x [m]", "y": "y [m]",
+        "rate": "1/s", "clock": "s", "x": "x [m]", "y": "y [m]",
     }  # fmt: skip
     return {
         "labels": {name: units.named(label) for name, label in labels.items()},

@@ -86,7 +86,10 @@ def case_page_content(folder: Path) -> PageContent:
     return PageContent(
         title=f"Case {case.name}, before any diagnosis",
         lines=(f"{len(rig.actuators)} inputs, {len(rig.sensors)} sensors, {len(records)} records.",),
-        blocks=[*moving_modes(rig, {"nominal": rig.modes}), block(plot_responses({"nominal": rig}, records), caption)],
+        blocks=[
+            *moving_modes(rig, {"nominal": rig.modes}, units=case.units),
+            block(plot_responses({"nominal": rig}, records), caption),
+        ],
         tables=[
             ("Records", ("record", "use", "samples", "sample rate [Hz]", level), rows),
             ("Nominal modes", ("mode", "frequency [Hz]", "damping ratio"), modes),
@@ -223,7 +226,7 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
     sensed = [
         [
             one["design"],
-            short(one["margin"]),
+            short(one["decay_rate"] if "decay_rate" in one else one["margin"]),  # margin: files of earlier versions
             _stability_of(one),
             *_words([one.get("limited_by", ""), one.get("path", "")]),
             "" if one.get("robustness") is None else one["robustness"],

@@ -239,7 +239,7 @@ def test_candidates_are_searched_whole(task):
 
 
 def test_which_limits_conflict_is_said(task):
-    with pytest.raises(DesignError, match=r"the limit of condition is 3[.]9, and the least"):
+    with pytest.raises(DesignError, match=r"the limit of the condition number is 3[.]9, and the least"):
         place_actuators(task, Limits(condition=3.9), starts=1)
     with pytest.raises(DesignError, match=r"the limit of peak force is 0[.]01 N, and the least"):
         scan(task, Limits(peak_force=0.01), n_places=20)

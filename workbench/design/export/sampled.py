@@ -82,7 +82,7 @@ class SampledDesign(Printed):
         return command_words(self.modes.domain, self.source.law.actuators, self.units)
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
-        late = f", {1e3 * self.computing_delay:.4g} ms to compute" if self.computing_delay else ""
+        late = f", computation delay {1e3 * self.computing_delay:.4g} ms" if self.computing_delay else ""
         line = f"{self.controller.name} at {self.sample_rate_hz:.6g} Hz{late}"
         own = self.source.law.controlled
         rows = [
@@ -201,7 +201,7 @@ def _too_slow(stable: Callable[[float], bool], rate: float, delay: float) -> str
         slow, fast = (slow, middle) if stable(middle) else (middle, fast)
     least = next(r for r in (_round_up(fast), 1.1 * fast, 2.0 * fast) if stable(r) or r > 1.5 * fast)
     return (
-        f"at {rate:g} Hz the loop is unstable, for the hold delays by half a sample; sample at"
+        f"at {rate:g} Hz the loop is unstable, as the zero-order hold adds a delay of half a sample; sample at"
         f" {_round_up(least):g} Hz or more, or lower the gains"
     )
 

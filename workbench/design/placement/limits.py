@@ -122,8 +122,8 @@ class Limits(Constructed):
         needed = 2 * margin + (n - 1) * self.spacing
         if needed > length:
             raise DesignError(
-                f"{n} actuators {self.spacing:g} apart and {margin:g} from the ends need {needed:g} m; the"
-                f" structure has {length:g}: lower spacing or edge_distance"
+                f"{n} actuators {self.spacing:g} m apart and {margin:g} m from the ends need {needed:g} m; the"
+                f" structure has {length:g} m: lower spacing or edge_distance"
             )
         intervals = self.allowed(length, clear)
         spacing, at, fit = max(self.spacing, APART * length), -np.inf, 0
@@ -134,7 +134,7 @@ class Limits(Constructed):
             at -= spacing
         if fit < n:
             raise DesignError(
-                f"of {n} actuators {self.spacing:g} apart only {fit} find room on the allowed intervals,"
+                f"of {n} actuators {self.spacing:g} m apart only {fit} find room on the allowed intervals,"
                 f" {', '.join(f'{low:g} to {high:g}' for low, high in intervals)} m: forbid less or lower the spacing"
             )
         return intervals
@@ -225,13 +225,14 @@ def conflict(task: PlacementTask, limits: Limits, grid: np.ndarray | None = None
             (one, limit, _), (other, other_limit, least) = (texts(x, within[first] & spaced) for x in (first, second))
             return (
                 f"{head}: the limit of {one}, {limit}, and the limit of {other}, {other_limit}, conflict; with the"
-                f" first the least {other} found was {least}: raise one of them"
+                f" first the least {other.removeprefix('the ')} found was {least}: raise one of them"
             )
     return f"{head} together, though any two can be met; raise one of them"
 
 
 def _words(name: str) -> str:
-    return name.replace("_", " ")
+    """The name of a limited cost, as in: the limit of peak force."""
+    return {"condition": "the condition number"}.get(name, name.replace("_", " "))
 
 
 def _samples(low: np.ndarray, high: np.ndarray, per_side: int) -> np.ndarray:

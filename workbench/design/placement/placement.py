@@ -87,7 +87,7 @@ def place_actuators(task: PlacementTask, limits: Limits, *, starts: int = 12, se
     guesses = _guesses(task, limits, boxes, starts, rng)
     size = domain.size
     optima: list[tuple[np.ndarray, float]] = []
-    status = "no start ended inside the limits"
+    status = "no start converged to a feasible point"
     for guess in guesses:
         # each actuator stays in the box nearest to its start; one that ends on the edge moves to the adjacent box
         homes = [min(boxes, key=partial(_distance_to_box, x)) for x in guess]

@@ -77,7 +77,7 @@
       ask();
     });
     transducers("actuators", "actuators");
-    transducers("sensors", "sensors (none: exact modes)");
+    transducers("sensors", "sensors (none: exact modal coordinates)");
     var t = row(labels.final_time), time = html("input", { id: "time", type: "number", min: 0, step: "any", value: +design.final_time.toPrecision(4) }, t);
     time.addEventListener("change", function () { if (+time.value > 0) { design.final_time = +time.value; ask(); } });
     weights();
@@ -339,7 +339,7 @@
     cards.stable.textContent = undamped ? "undamped" : answer.stable ? "stable" : "unstable";
     cards.stable.nextSibling.textContent = "closed loop; " + (undamped ?
       answer.undamped + (answer.undamped > 1 ? " pairs of poles" : " pair of poles") + " on the imaginary axis" :
-      "rightmost pole at " + shown(answer.rightmost) + " " + labels.rate);
+      "real part of the rightmost pole " + shown(answer.rightmost) + " " + labels.rate);
     cards.stable.className = undamped ? "" : answer.stable ? "good" : "bad";
     reach = 1e-12;
     for (var k = 0; k < answer.time.length; k += 5) displaced(k).concat(idle(k)).forEach(function (w) { reach = Math.max(reach, Math.abs(w)); });
@@ -395,7 +395,7 @@
       else if (plate) shape[0].setAttribute("href", painted(shape[1]));
       else shape[0].setAttribute("d", "M" + shape[1].map(function (w, i) { return X(setting.x[i]).toFixed(1) + "," + (beamY - size * w).toFixed(1); }).join("L"));
     });
-    by("clock").textContent = "t = " + shown(answer.time[k]) + " s";
+    by("clock").textContent = "t = " + shown(answer.time[k]) + " " + labels.clock;
   }
   function step(now) {
     if (playing && last !== null) { clock += (now - last) / 10000; animate(); }

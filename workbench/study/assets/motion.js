@@ -135,7 +135,7 @@ workbench.move = function (root, spec) {
       t.line.setAttribute("visibility", t.on && spots ? "visible" : "hidden");
       if (!spots) return;
       t.line.setAttribute("d", joined(spots, t.at));
-      if (modes) words.push((spec.tracks.length > 1 ? t.spec.label + ": " : "") + workbench.shown(t.spec.frequencies_hz[mode]) + " Hz, ζ " + workbench.shown(100 * t.spec.damping[mode]) + " %");
+      if (modes) words.push((spec.tracks.length > 1 ? t.spec.label + ": " : "") + workbench.shown(t.spec.frequencies_hz[mode]) + " " + (spec.unit || "Hz") + ", ζ " + workbench.shown(100 * t.spec.damping[mode]) + " %");
     });
     else tracks.forEach(function (t) {
       var x = t.spec.x || spec.x, w = modes ? swung(t.spec, Math.PI * clock) : displaced(t.spec, frame);
@@ -146,11 +146,11 @@ workbench.move = function (root, spec) {
       t.line.setAttribute("d", path(x, w));
       if (modes) {
         t.ghost.setAttribute("d", path(x, swung(t.spec, 0)) + path(x, swung(t.spec, Math.PI)));
-        words.push((spec.tracks.length > 1 ? t.spec.label + ": " : "") + workbench.shown(t.spec.frequencies_hz[mode]) + " Hz, ζ " + workbench.shown(100 * t.spec.damping[mode]) + " %");
+        words.push((spec.tracks.length > 1 ? t.spec.label + ": " : "") + workbench.shown(t.spec.frequencies_hz[mode]) + " " + (spec.unit || "Hz") + ", ζ " + workbench.shown(100 * t.spec.damping[mode]) + " %");
       }
     });
     if (slider) slider.value = frame;
-    readout.textContent = modes ? words.join(" · ") : "t = " + spec.time[frame].toFixed(spec.time[spec.time.length - 1] > 20 ? 1 : 3) + " s";
+    readout.textContent = modes ? words.join(" · ") : "t = " + spec.time[frame].toFixed(spec.time[spec.time.length - 1] > 20 ? 1 : 3) + " " + (spec.unit || "s");
   }
   function step(now) {
     if (!seen || !root.isConnected) { last = null; return; }

@@ -193,10 +193,10 @@ def of_frfs(found: FrfModes, measured: FrequencyResponses) -> IdentificationRepo
         here = (at >= low) & (at <= high)
         doubtful |= here & complex_shape
         lines.append(
-            f"between {low:.6g} and {high:.6g} Hz the search reached its limit of modes, the residual above the"
-            f" noise: of {here.sum()} modes there {(here & complex_shape).sum()} are not reported, as their shapes are"
-            " complex (low phase collinearity). Roving sensors or hammers, or a structure that changes, make the data"
-            " inconsistent: exclude the band by --band-hz, or allow more --modes"
+            f"between {low:.6g} and {high:.6g} Hz the search reached its limit on the number of modes with the"
+            f" residual above the noise: {(here & complex_shape).sum()} of the {here.sum()} modes there are not"
+            " reported, as their shapes are complex (low phase collinearity). Roving sensors or hammers, or a structure"
+            " that changes, make the data inconsistent: exclude the band by --band-hz, or allow more --modes"
         )
     for r, parts in enumerate(found.cluster_hz):
         if parts:

@@ -128,7 +128,8 @@ def _moving(found: Redesign, old: Response, new: Response, caption: str) -> dict
     actuators = [a for a in found.uncertain_rig.rig.actuators if a.name in found.redesigned.actuators]
     sensors = [s for s in found.uncertain_rig.rig.sensors if s.name in found.redesigned.sensors]
     both, colours = {"present": limited, "redesigned": new}, {"present": OLD, "redesigned": NEW}
-    motion = response_motion(both, actuators=actuators, sensors=sensors, colours=colours, length=found.units.length)
+    units = {"length": found.units.length, "time": found.units.time}
+    motion = response_motion(both, actuators=actuators, sensors=sensors, colours=colours, **units)
     grown = np.abs(old.modal[: old.modes.n_modes]).max() > limit
     cut = f" The present one diverges; its motion is clipped at {DRAWN_LIMIT:g} times the other's." if grown else ""
     return block(motion, f"{caption}: the corrected structure under the present and the redesigned controller.{cut}")

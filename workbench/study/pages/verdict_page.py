@@ -18,6 +18,7 @@ from workbench.gap.effects.nonlinear import BEYOND
 from workbench.gap.report.verdict import Verdict, rest_in_words
 from workbench.identification.signal.distortion import Distortion, distortion_of
 from workbench.records.record import Record
+from workbench.records.units import SI, Units
 from workbench.rig.rig import Rig
 from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes
@@ -64,7 +65,7 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
         blocks.append(block(plot_distortion(distortions), seen))
     if verdict.shows_gap:
         modes = {"nominal": nominal, **({fitted: corrected} if changed and fitted in rigs else {})}
-        blocks += moving_modes(verdict.nominal, modes, length=verdict.units.length)
+        blocks += moving_modes(verdict.nominal, modes, units=verdict.units)
     page_content = PageContent(
         title=f"Diagnosis of {verdict.case}",
         lead=verdict.sentence,
@@ -151,15 +152,16 @@ def _of_lowest_and_highest(records: Sequence[Record]) -> list[Distortion]:
     return found if len(found) < 2 else [found[0], found[-1]]
 
 
-def moving_modes(rig: Rig, modes: Mapping[str, Modes], *, length: str = "m") -> list[dict[str, Any]]:
+def moving_modes(rig: Rig, modes: Mapping[str, Modes], *, units: Units = SI) -> list[dict[str, Any]]:
     """A block of animated modes; none if their shapes are known only at points without positions."""
     domain = rig.modes.domain
     placed = isinstance(domain, NamedPoints) and domain.positions is not None and len(set(domain.nodes)) > 2
     if not placed and (rig.structure is None or isinstance(domain, NamedPoints)):
         return []
-    motion = mode_motion(modes, actuators=rig.actuators, sensors=rig.sensors)
+    frequency = units.named("Hz")
+    motion = mode_motion(modes, actuators=rig.actuators, sensors=rig.sensors, frequency=frequency)
     if motion.get("label") == ALONG:
-        motion["label"] = f"x [{length}]"
+        motion["label"] = units.named(ALONG)
     return [block(motion, MOVING)]
 
 
