@@ -454,9 +454,10 @@ def test_one_bracket_in_place_of_two_is_told(tmp_path):
 
 
 def test_units_are_named_all_four_or_none(case, tmp_path):
-    millimetres = Units("mm", "t", "s", "N")
+    millimetres, milliseconds = Units("mm", "t", "s", "N"), Units("mm", "kg", "ms", "kN")
     write_case(replace(case, units=millimetres), tmp_path / "in mm")
     read = read_case(tmp_path / "in mm")
+    assert "sample rate [Hz]" in str(read) and "sample rate [1/ms]" in str(replace(case, units=milliseconds))
     assert read.units == millimetres and [c.unit for c in read.fit[0].output_channels] == ["mm", "mm/s^2"]
     file = tmp_path / "in mm" / "case.toml"
     file.write_text(file.read_text().replace('force = "N"\n', ""))

@@ -23,6 +23,6 @@ def test_the_commands_of_the_page_close_the_loop(run, tmp_path, monkeypatch):
     frequencies = [float(f) for f in re.findall(r"^\s*\d+\s+([\d.]+)", said["identify"], re.M)]
     assert frequencies[:2] == pytest.approx([2.9518, 11.807], rel=1e-3)  # (r π / L)² √(EI/m) / 2π
     assert "A delay of the actuators (all: delay 0.004 s)" in said["diagnose"]
-    assert "stable on 200 of 200 Monte Carlo samples" in said["redesign"] and "the redesigned one" in said["redesign"]
+    assert "stable on 200 of 200 Monte Carlo draws" in said["redesign"] and "the redesigned one" in said["redesign"]
     assert "command of F2, 2 samples ago" in Path("after.h").read_text(encoding="utf-8")
     assert "the model is validated on 1 of 1 tests" in said["check"]

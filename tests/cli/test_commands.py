@@ -14,6 +14,7 @@ from workbench.records.files import write_record
 from workbench.records.record import Channel, Record
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
+from workbench.study.report import page_content_in
 
 RIG = """
 [structure]
@@ -172,6 +173,17 @@ def test_designs_and_placements_are_told_in_the_units_of_the_file(rig, tmp_path)
     assert "W_C [N mm]  W_R [N mm]" in laws and "R weights FᵀF" in laws
     placed = run("place", rig, "--controlled-modes", 2, "--figure", tmp_path / "places.png")
     assert "positions [mm]" in placed.output and "W_R [N mm]" in placed.output and (tmp_path / "places.png").is_file()
+
+
+def test_decay_rates_are_told_in_the_unit_of_time_of_the_file(rig, tmp_path):
+    rig.write_text(rig.read_text() + '[units]\nlength = "mm"\nmass = "kg"\ntime = "ms"\nforce = "kN"\n')
+    found = tmp_path / "design.json"
+    laws = run("design", rig, "--controlled-modes", 4, "--weight", 20, "--json", found).output
+    assert "decay rate, -max Re λ [1/ms]" in laws and "1/s" not in laws
+    (limit,) = {one["limited_by"].split()[-1] for one in json.loads(found.read_text())["through_sensors"]}
+    assert limit == "1/ms"
+    (sensed,) = [heads for title, heads, _ in page_content_in(found).tables if title == "With sensors"]
+    assert sensed[1] == "decay rate, -max Re λ [1/ms]"
 
 
 def test_design_reports_the_works_of_section_5_8(rig, tmp_path):

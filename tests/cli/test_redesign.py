@@ -39,7 +39,7 @@ def test_a_late_actuator_is_made_up_for_and_shown(run, case, tmp_path):
     options = ("--verdict", verdict, "--damping", 0.3, "--draws", 6, "--page", page, "--json", told, "--to", code)
     done = run("redesign", folder, *options)
     assert done.exit_code == 0, done.output
-    assert "stable on 6 of 6 Monte Carlo samples" in done.output and "F1: delay 40 ms" in done.output
+    assert "stable on 6 of 6 Monte Carlo draws" in done.output and "F1: delay 40 ms" in done.output
     assert "the range of 6 draws, not of 95 %, which need 40 draws or more" in " ".join(done.output.split())
     assert re.search(r"test: an impulse of \S+ N s at x = \S+, which moves the structure as far", done.output)
     assert "in the new controller" in done.output and "  loss: vibration and effort above those with" in done.output

@@ -272,8 +272,8 @@ def test_no_gap_is_told_only_where_records_held_out_have_none_either(hinged_rig,
         if disagreeing:
             share = f"{100 * verdict.shrinkage.after[disagreeing[0]]:.0f} %"
             assert verdict.sentence == (
-                "In the records that were fitted, there is no gap beyond the noise of the sensors; but validation"
-                f" record {disagreeing[0]} disagrees by {share} of its signal: fit it too."
+                "In the records that were fitted, there is no gap beyond the noise of the sensors; but the residual of"
+                f" validation record {disagreeing[0]} is {share} of its signal: include it in the fit."
             )
     assert verdict.notes == ("In validation record crossed, the outputs d1 and d3 are exchanged: swap them.",)
 

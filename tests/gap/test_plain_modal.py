@@ -15,6 +15,7 @@ from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.nominal import NOMINAL_ERRORS
 from workbench.gap.prediction.unmodelled_force import gauss_markov_force_filter, sampled_model
 from workbench.records.record import Channel, Record
+from workbench.records.units import Units
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
@@ -179,6 +180,9 @@ def test_a_limit_and_a_gain_are_found_beside_shapes_that_are_off(spacecraft):
     shares = [bar.get_height() for bar in axes[0].patches]
     assert shares[0] == pytest.approx(100.0 * verdict.where.band_shares[0], abs=1.0)  # below 0.34 Hz: what drifts
     assert axes[0].get_xticklabels()[0].get_text() == "rigid, 1 to 2" and sum(shares) == pytest.approx(100.0, abs=0.5)
+    assert axes[1].get_xlabel() == "upper edge of the band [Hz]"
+    told = plot_where(replace(verdict, units=Units("mm", "kg", "ms", "kN"))).axes
+    assert told[1].get_xlabel() == "upper edge of the band [1/ms]"
     below, names = (
         [bar.get_x() + bar.get_width() for bar in axes[5].patches],
         [label.get_text() for label in axes[5].get_yticklabels()],

@@ -14,6 +14,7 @@ from workbench.draw.plot import plot
 from workbench.draw.robust import plot_prediction
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect
+from workbench.records.units import Units
 from workbench.rig.elements import RandomForce
 from workbench.rig.simulate import simulate
 from workbench.robust.check import PredictionCheck, check_prediction, log_test, read_log
@@ -112,7 +113,7 @@ def test_a_model_holds_where_its_worst_sensor_has_what_is_expected_of_it(n):
         assert check.holds is bool(share >= check.expected_least) is bool(share > n // 100 / n)
         assert ("is consistent with the model" in check.sentence) is check.holds
         assert not replace(check, allowed=1.15).holds
-    assert "no test of the model: its bands allow for an error of 115 %" in replace(check, allowed=1.15).sentence
+    assert "does not test the model: the bands allow for an error of 115 %" in replace(check, allowed=1.15).sentence
 
 
 def test_coloured_noise_of_the_same_size_is_seen_in_the_spectrum_alone(plain, tmp_path):
@@ -179,6 +180,23 @@ def test_bands_are_drawn_by_sensor_over_time_and_frequency(plain):
     figure = plot(predict(uncertain(plain), new, draws=60))
     labels = [ax.get_ylabel() for ax in figure.axes]
     assert labels[0] == "d1\n[m]" and [ax.get_xlabel() for ax in figure.axes[-2:]] == ["time [s]", "frequency [Hz]"]
+
+
+def test_bands_and_checks_are_told_in_the_units_of_the_case(plain):
+    milliseconds = Units("mm", "kg", "ms", "kN")
+    new = measured(plain, 1.0, np.random.default_rng(7), n=100)
+    told = predict(uncertain(plain), new, draws=40, units=milliseconds)
+    figure = plot(told)
+    assert figure.axes[0].get_ylabel() == "d1\n[mm]"
+    assert [ax.get_xlabel() for ax in figure.axes[-2:]] == ["time [ms]", "frequency [1/ms]"]
+    slow = predict(uncertain(plain), new.inputs, sample_time=0.02, draws=40, units=milliseconds)
+    assert slow.notes[-1].startswith("Modes at 28.27 1/ms lie above the Nyquist frequency of 25 1/ms")
+    check = check_prediction(told, new)
+    assert " 1/ms [%]" in str(check) and "Hz" not in str(check)
+    none = replace(check, coverage=np.ones(2), band_coverage=np.zeros_like(check.band_coverage))
+    assert " 1/ms, where 0 % of the amplitudes" in none.sentence and none.decisive[0].endswith(" 1/ms")
+    with pytest.raises(ValueError, match=r"the prediction 100 of 0\.01 ms"):
+        check_prediction(told, replace(new, sample_time=0.02))
 
 
 def test_a_record_too_slow_for_a_mode_is_noted_and_one_too_short_is_refused(plain):

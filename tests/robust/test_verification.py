@@ -35,7 +35,7 @@ def test_what_no_loop_can_be_made_of_is_refused(rig):
         with pytest.raises(TypeError, match=match):
             verify(*wrong)
     for draws in (2.5, 0, np.nan, np.inf):
-        with pytest.raises(ValueError, match="draws, the number of samples of the uncertain rig, is a whole"):
+        with pytest.raises(ValueError, match="draws, the number of realisations of the uncertain rig, is a whole"):
             verify(certain, controller, test, draws=draws)
     assert verify(certain, controller, test, draws=2.0).n_draws == 2
     for given, match in (

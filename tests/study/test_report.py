@@ -2,10 +2,17 @@
 
 import json
 
+import numpy as np
 import pytest
 
+from workbench.cases.case import Case
+from workbench.cases.writing import write_case
+from workbench.records.units import Units
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
 from workbench.study.pages.page import write_page
-from workbench.study.report import page_content_about, page_content_in
+from workbench.study.report import case_page_content, page_content_about, page_content_in
 from workbench.study.runs.cases import StudyError
 
 VERDICT = {
@@ -91,6 +98,16 @@ def test_identified_modes_are_shown_to_the_digits_of_their_errors_and_damping_in
     assert caption.endswith("The bars are shorter than the dots: no standard error is above 0.35 % of its value.")
     seen = page_content_in(written(tmp_path, {**two, "damping_std": [1e-3, 1e-3]})).blocks[1]["caption"]
     assert seen == "Damping of each mode, ± 2 standard errors."
+
+
+def test_a_case_is_shown_in_its_units(tmp_path, hinged_beam):
+    rig = Rig(hinged_beam.modes(2), (Actuator("F1", 0.45),), (Sensor("d1", 0.3),), structure=hinged_beam)
+    record = rig.record(np.ones((1, 100)), np.sin(np.arange(100.0))[None], sample_time=0.1, name="low")
+    case = Case("in ms", rig, (record,), (), units=Units("mm", "kg", "ms", "kN"))
+    shown = case_page_content(write_case(case, tmp_path / "in ms").parent)
+    heads = [heads for _, heads, _ in shown.tables]
+    assert "sample rate [1/ms]" in heads[0] and heads[1] == ("mode", "frequency [1/ms]", "damping ratio")
+    assert shown.blocks[-1]["figure"]["panels"][-1]["x"]["label"] == "time [ms]"
 
 
 @pytest.mark.parametrize("counted_from", [1, 0])

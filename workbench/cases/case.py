@@ -50,7 +50,7 @@ class Case(Printed):
             for use, records in (("fit", self.fit), ("validate", self.validation))
             for record in records
         ]
-        return line, ("record", "use", "samples", "sample rate [Hz]"), rows, ()
+        return line, ("record", "use", "samples", self.units.named("sample rate [Hz]")), rows, ()
 
 
 def read_case(folder: str | Path) -> Case:

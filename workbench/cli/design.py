@@ -12,6 +12,7 @@ from workbench.structure.printed import command_headings
 
 if TYPE_CHECKING:
     from workbench.design.spillover.explain import Explanation
+    from workbench.records.units import Units
     from workbench.rig.rig import Rig
 
 PERIODS = 20  # default final time of the work, in periods of the first mode
@@ -85,8 +86,8 @@ def design(
             say(f"  {why}")
         else:
             share = None if perturbed is None else stable_share(perturbed, controller)
-            sensed.append(_sensed(controller.name, explained, found, share, len(perturbed or ())))
-    heads = ["controller", "decay rate, -max Re λ [1/s]", "limiting residual mode, Re λ", "path"]
+            sensed.append(_sensed(controller.name, explained, found, units, share, len(perturbed or ())))
+    heads = ["controller", units.named("decay rate, -max Re λ [1/s]"), "limiting residual mode, Re λ", "path"]
     if errors is not None and perturbed is not None:
         heads.append(f"stable of {len(perturbed)} models with {100 * errors:.3g} % error")
     show_table(heads, [row for row, _ in sensed])
@@ -119,11 +120,11 @@ def design(
 
 
 def _sensed(
-    name: str, explained: "Explanation", rig: "Rig", share: float | None, count: int
+    name: str, explained: "Explanation", rig: "Rig", units: "Units", share: float | None, count: int
 ) -> tuple[list[str], dict[str, Any]]:
     """A controller that works through sensors, as a row of the table and as JSON; `share` of `count` is stable."""
     rate, stability = f"{explained.decay_rate:.3g}", explained.loop.stability
-    limiting, path = _limit(explained, rig)
+    limiting, path = _limit(explained, rig, units)
     row = [name, {"stable": rate, "unstable": f"{rate} unstable"}.get(stability, stability), limiting, path]
     return row + ([] if share is None else [str(round(share * count))]), {
         "design": name,
@@ -138,7 +139,7 @@ def _sensed(
     }
 
 
-def _limit(explained: "Explanation", rig: "Rig") -> tuple[str, str]:
+def _limit(explained: "Explanation", rig: "Rig", units: "Units") -> tuple[str, str]:
     """The residual mode that limits the decay rate, and the path through which it does, as text."""
     no_growth = not explained.loop.unstable_poles.size
     worst = explained.limiting if no_growth else explained.destabilising
@@ -147,7 +148,7 @@ def _limit(explained: "Explanation", rig: "Rig") -> tuple[str, str]:
     if worst is None:
         return "none: unstable without residual modes" if explained.reduced_decay_rate <= 0 else "no single mode", ""
     grows = no_growth or worst.closed_pole.real > 0
-    pole = f"{worst.closed_pole.real:+.3g} 1/s" if grows else "stable without this mode"
+    pole = f"{worst.closed_pole.real:+.3g} {units.named('1/s')}" if grows else "stable without this mode"
     at = worst.dominant.sensor_at
     names = [sensor.name for sensor in rig.sensors if sensor.at == at]
     return f"mode {worst.mode + 1}: {pole}", f"{', '.join(names)} → {worst.dominant.actuator}"

@@ -69,7 +69,5 @@ Disturbance = Annotated[
 RecordName = Annotated[
     str, typer.Argument(metavar="RECORD", help="File with a column for each input, or a record of the case by name.")
 ]
-Draws = Annotated[
-    int, typer.Option(help="Samples of the uncertain model from which the bands are computed, 40 or more.")
-]
-Seed = Annotated[int, typer.Option(min=0, help="Seed of the samples and of the noise.")]
+Draws = Annotated[int, typer.Option(help="Draws of the uncertain model from which the bands are computed, 40 or more.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the draws and of the noise.")]

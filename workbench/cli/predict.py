@@ -1,6 +1,5 @@
 """`workbench predict`: the readings of the next test of a case, with prediction bands."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -66,7 +65,6 @@ def predicted(
     case: "Case", record: Record, verdict: Path | None, *, draws: int, seed: int, workers: int | None
 ) -> "Prediction":
     """The prediction of a record by the corrected rig, with bands from its uncertainty."""
-    from workbench.cases.case import in_units
     from workbench.robust.prediction import check_draws
     from workbench.robust.prediction import predict as predict_record
 
@@ -74,8 +72,9 @@ def predicted(
     with reporting("reading") as report:
         uncertain, noise = uncertain_rig(case, verdict, workers=workers, report=sub_progress(report, 0.0, 0.7))
         progress = sub_progress(report, 0.7, 1.0)
-        found = predict_record(uncertain, record, noise_std=noise, draws=draws, seed=seed, progress=progress)
-    return replace(found, channels=in_units(found.channels, case.units))
+        return predict_record(
+            uncertain, record, noise_std=noise, draws=draws, seed=seed, units=case.units, progress=progress
+        )
 
 
 def record_of(case: "Case", name: str, sample_rate_hz: float | None) -> Record:

@@ -59,7 +59,7 @@ def redesign(
     ] = float("inf"),
     draws: Annotated[
         int,
-        typer.Option(min=1, max=10_000, help="Samples of the uncertain model on which both controllers are verified."),
+        typer.Option(min=1, max=10_000, help="Draws of the uncertain model on which both controllers are verified."),
     ] = 200,
     seed: options.Seed = 0,
     workers: options.Workers = None,

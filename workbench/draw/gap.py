@@ -103,7 +103,8 @@ def plot_where(verdict: Verdict) -> Figure:
     _plot_modes(by_mode, verdict)
     tops = [f"{top:.3g}" if top < 1000.0 else f"{top:.0f}" for top in where.band_edges_hz[1:]]
     by_octave.bar(tops, 100 * where.band_shares, color=COLOURS[0])
-    by_octave.set(title="by octave", xlabel="upper edge of the band [Hz]", ylabel="share of the gap's power [%]")
+    by_octave.set(title="by octave", ylabel="share of the gap's power [%]")
+    by_octave.set_xlabel(verdict.units.named("upper edge of the band [Hz]"))
     names = [s.name for s in verdict.nominal.sensors]
     by_sensor.bar(names, 100 * where.sensor_shares, color=COLOURS[2])
     by_sensor.set(title="by sensor", ylabel="share of the gap's power [%]")

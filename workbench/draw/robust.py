@@ -34,7 +34,7 @@ def plot_redesign(result: Redesign) -> Figure:
     left.axhline(SETTLED, color=GREY, linewidth=0.8)
     left.annotate("settling threshold", (time[-1], SETTLED), (0, 3), textcoords="offset points", fontsize=8, ha="right")
     left.set(xlabel=f"time [{result.units.time}]", ylabel="modal energy / peak energy [-]", ylim=(1e-6, 3.0))
-    left.set_title(f"{result.verification.n_draws} samples of the uncertain model: median and 95 % interval")
+    left.set_title(f"{result.verification.n_draws} draws of the uncertain model: median and 95 % interval")
     left.legend(fontsize=8)
     rows = np.arange(len(result.controlled))
     for shift, (name, verification, colour) in zip((-0.12, 0.12), both, strict=True):
@@ -50,7 +50,7 @@ def plot_redesign(result: Redesign) -> Figure:
 
 
 def plot_steps(result: Redesign) -> Figure:
-    """The loss after each step, relative to perfect actuators and sensors."""
+    """The loss after each step, relative to ideal actuators and sensors."""
     figure, ax = new_figure(width=9, height=1.2 + 0.45 * len(result.steps))
     names = [step.name + ("" if step.kept else " (left out)") for step in result.steps]
     most = max((s.loss for s in result.steps if not s.diverges), default=1.0)
@@ -101,8 +101,8 @@ def plot_prediction(prediction: Prediction, measured: Record | None = None) -> F
     whole = time.size == prediction.time.size
     axes[0, 0].set_title("readings over time" if whole else "readings near the one farthest outside its band")
     axes[0, 1].set_title("amplitude spectrum of the whole record")
-    axes[-1, 0].set_xlabel("time [s]")
-    axes[-1, 1].set_xlabel("frequency [Hz]")
+    axes[-1, 0].set_xlabel(f"time [{prediction.units.time}]")
+    axes[-1, 1].set_xlabel(f"frequency [{prediction.units.named('Hz')}]")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=3, fontsize=8)
     return plain_ticks(figure)
 

@@ -39,7 +39,7 @@ class Redesign:
         present_verification, verification: of both, on the same draws.
         weight: ρ of the cost J; 0 for on-off control.
         criterion: "cost": J = 2 ∫ energy dt + ρ ∫ FᵀF dt, with ρ such that both terms are equal over the controlled
-            modes where actuators and sensors are perfect; "settling": J = t + ρ ∫ FᵀF dt with t the settling time of
+            modes where actuators and sensors are ideal; "settling": J = t + ρ ∫ FᵀF dt with t the settling time of
             the controlled modes, at most that of the test, and ρ such that both terms are equal there.
         max_cost_increase, max_work_increase: allowed relative increase of the cost J and of the work W over those of
             the present controller.
@@ -120,9 +120,9 @@ class Redesign:
         what = "vibration" if self.criterion == "cost" else "time"
         texts = []
         if cost > self.max_cost_increase:
-            texts.append(f"costs {_percent(cost)} more, {what} and effort taken together: {_allowing('cost', cost)}")
+            texts.append(f"its cost J ({what} and effort) is {_percent(cost)} higher: {_allowing('cost', cost)}")
         if work > self.max_work_increase:
-            texts.append(f"takes {_percent(work)} more work: {_allowing('work', work)}")
+            texts.append(f"its work W is {_percent(work)} higher: {_allowing('work', work)}")
         return ", and ".join(texts)
 
     @cached_property
@@ -171,15 +171,15 @@ class Redesign:
         old, new = self._both
         unstable = old.n_draws - old.n_stable
         if old.share_stable < 0.5:
-            text = f"the present controller is unstable on {unstable:,} of {old.n_draws:,} samples; redesigned, it "
+            text = f"the present controller is unstable on {unstable:,} of {old.n_draws:,} draws; redesigned, it "
             text += self._behaviour(new, "95 %: ")
         else:
             work = self._times("work", "all_work")
             text = f"the present controller {self._behaviour(old, '95 %: ')}"
-            text += f", unstable on {unstable} samples" if unstable else ""
+            text += f", unstable on {unstable} draws" if unstable else ""
             text += f"; redesigned: {self._behaviour(new, '', named=False)}, {self._times('effort')}"
             text += "" if work.startswith(AS_MUCH) else f" and {work}"
-        text = f"On the corrected model {text}; stable on {_stable(new)} Monte Carlo samples."
+        text = f"On the corrected model {text}; stable on {_stable(new)} Monte Carlo draws."
         return f"{text} {self.spillover_warning}".rstrip()
 
     @property
@@ -189,7 +189,7 @@ class Redesign:
         if self._no_controller:
             return self._no_controller
         if new.n_stable < old.n_stable:
-            why = "it is stable on more samples of the model"
+            why = "it is stable on more draws of the model"
         elif self._better and np.isfinite(self._over).all():
             why = f"the new one {self._difference}, but {self._more}"
         else:
@@ -203,7 +203,7 @@ class Redesign:
         if max(old.share_stable, new.share_stable) >= 0.5:
             return ""
         return (
-            f"Use neither controller: the present one is stable on {_stable(old)} samples of the model, the redesigned"
+            f"Use neither controller: the present one is stable on {_stable(old)} draws of the model, the redesigned"
             f" on {new.n_stable:,}; increase R, make the estimator slower, control fewer modes, or read more sensors."
         )
 
@@ -227,13 +227,13 @@ class Redesign:
         if new.n_stable != old.n_stable:
             return f"Use the redesigned controller: it {self._difference}."
         if max(1.0 - self._over[0], self._sooner_by) < GAINED:
-            return f"Either controller does: the redesigned {self._difference} (medians of the samples of the model)."
+            return f"The controllers are equivalent: the redesigned {self._difference} (medians of the draws)."
         forces = self._medians("peak_force")
         at_first, now = (f"{force:.3g} {self.units.force}" for force in forces)
         forced = f", with at most {now} instead of {at_first}" if np.isfinite(forces).all() and now != at_first else ""
         of_draw = self._cost if self._over[0] < 1.0 else attrgetter(self._settling)
         before, after = (of_draw(one)[old.stable & new.stable] for one in self._both)
-        sure = f"it does better on {int((after < before).sum()):,} of {new.n_draws:,} samples"
+        sure = f"it does better on {int((after < before).sum()):,} of {new.n_draws:,} draws"
         return f"Use the redesigned controller: it {self._difference}{forced} (medians); {sure}."
 
     @property
@@ -241,7 +241,7 @@ class Redesign:
         """The difference of the redesigned controller from the present one, in words."""
         old, new = self._both
         if new.n_stable != old.n_stable:
-            return f"is stable on {_stable(new)} samples, the present one on {old.n_stable:,}"
+            return f"is stable on {_stable(new)} draws, the present one on {old.n_stable:,}"
         before, after = self._medians(self._settling)
         if self.criterion == "settling":
             own, old_time = self._settles(after, " the controlled modes"), self._settles(before, " them")
@@ -298,7 +298,8 @@ class Redesign:
             return f"No stability guarantee: {error}, and on-off control has no small-gain margin."
         bears = f"the small-gain margin is {_percent(min(margin, 9.99))}"
         # the share is a mean over frequencies, and the bound must hold at each
-        sure = "guaranteed if the share exceeds that at no frequency" if margin > share else "not guaranteed"
+        below = "the unexplained share stays below this margin at every frequency"
+        sure = f"guaranteed if {below}" if margin > share else "not guaranteed"
         return f"No effect explains the gap: {error}; {bears}, so stability is {sure}."
 
     def __repr__(self) -> str:
@@ -348,7 +349,7 @@ def _percent(share: float) -> str:
 
 
 def _allowing(name: str, increase: float) -> str:
-    return f"max_{name}_increase = {np.ceil(100.0 * increase) / 100.0:g} allows it"
+    return f"allow it by max_{name}_increase = {np.ceil(100.0 * increase) / 100.0:g}"
 
 
 def _ratios(values: np.ndarray, lead: str) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 
 from workbench.arrays import Floats
 from workbench.records.record import Record
+from workbench.records.units import SI, Units
 from workbench.robust.prediction import Prediction
 from workbench.robust.verification import LEVEL
 from workbench.structure.modes import freeze
@@ -35,6 +36,7 @@ class PredictionCheck(Printed):
         expected: (n_draws, n_outputs, 1 + n_bands) the same shares of readings simulated by the model.
         allowed: rms of the model's unexplained residual over that of the readings; bands with 1 or more are no test
             of the model.
+        units: of the frequencies.
     """
 
     name: str
@@ -45,6 +47,7 @@ class PredictionCheck(Printed):
     bands_hz: Floats
     expected: Floats
     allowed: float = 0.0
+    units: Units = SI
 
     def __post_init__(self) -> None:
         freeze(self, "coverage", "band_coverage", "bands_hz", "expected")
@@ -92,8 +95,8 @@ class PredictionCheck(Printed):
         )
         if self.allowed >= 1.0:
             return (
-                f"This is no test of the model: its bands allow for an error of {100 * self.allowed:.3g} % of the"
-                f" readings, as much as without any model; {text}."
+                f"This record does not test the model: the bands allow for an error of {100 * self.allowed:.3g} % of"
+                f" the readings; {text}."
             )
         if self.holds:
             return f"The record is consistent with the model: {text}."
@@ -112,11 +115,15 @@ class PredictionCheck(Printed):
             j = int(np.argmin(self.band_coverage[:, k]))
             (low, high), shares = self.bands_hz[k], 100 * self.band_coverage[:, k]
             words.append(
-                f"the band from {low:.4g} to {high:.4g} Hz, where {shares.mean():.3g} % of the amplitudes lie inside"
-                f" ({shares[j]:.3g} % of {self.sensors[j]}), at least {100 * self.expected_least_in_bands:.3g} %"
-                " expected"
+                f"the band from {low:.4g} to {high:.4g} {self._hertz}, where {shares.mean():.3g} % of the amplitudes"
+                f" lie inside ({shares[j]:.3g} % of {self.sensors[j]}), at least"
+                f" {100 * self.expected_least_in_bands:.3g} % expected"
             )
         return words
+
+    @property
+    def _hertz(self) -> str:
+        return self.units.named("Hz")
 
     @property
     def _worst_band(self) -> int:
@@ -130,12 +137,12 @@ class PredictionCheck(Printed):
             k = self._worst_band
             low, high = self.bands_hz[k]
             share = float(self.band_coverage[:, k].mean())
-            return f"all, {low:.4g} to {high:.4g} Hz", share, self.expected_least_in_bands
+            return f"all, {low:.4g} to {high:.4g} {self._hertz}", share, self.expected_least_in_bands
         j = int(np.argmin(self.coverage))
         return self.sensors[j], float(self.coverage[j]), self.expected_least
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
-        bands = [f"{low:.3g} to {high:.3g} Hz [%]" for low, high in self.bands_hz]
+        bands = [f"{low:.3g} to {high:.3g} {self._hertz} [%]" for low, high in self.bands_hz]
         rows = [
             (name, f"{100 * share:.3g}", *(f"{100 * s:.3g}" for s in of_band))
             for name, share, of_band in zip(self.sensors, self.coverage, self.band_coverage)
@@ -143,7 +150,12 @@ class PredictionCheck(Printed):
         means = [self.overall, *self.band_coverage.mean(axis=0)]
         least = [self.expected_least, *[self.expected_least_in_bands] * len(bands)]
         rows.append(("mean", *(f"{100 * share:.3g}" for share in means)))
-        rows.append(("expected: any sensor, mean in a band", *(f"≥ {100 * share:.3g}" for share in least)))
+        rows.append(
+            (
+                "expected at least (time: each sensor; bands: mean of sensors)",
+                *(f"≥ {100 * share:.3g}" for share in least),
+            )
+        )
         return self.sentence, ("sensor", "over time [%]", *bands), rows, ()
 
 
@@ -188,15 +200,15 @@ def check_prediction(prediction: Prediction, record: Record) -> PredictionCheck:
             f"record {record.name!r} has no output {missing[0]!r}: it has {', '.join(measured)}; the prediction is of"
             f" {', '.join(names)}"
         )
-    n_samples, sample_time = prediction.time.size, prediction.sample_time
+    n_samples, sample_time, time = prediction.time.size, prediction.sample_time, prediction.units.time
     if record.n_samples != n_samples or abs(record.sample_time / sample_time - 1.0) > 1e-6:
         raise ValueError(
-            f"record {record.name!r} has {record.n_samples} samples of {record.sample_time:g} s; the prediction"
-            f" {n_samples} of {sample_time:g} s. Predict with this record's own inputs"
+            f"record {record.name!r} has {record.n_samples} samples of {record.sample_time:g} {time}; the prediction"
+            f" {n_samples} of {sample_time:g} {time}. Predict with this record's own inputs"
         )
     outputs = np.array([measured[name] for name in names])
     shares = prediction.coverage(outputs)
-    of_model = prediction.bands_hz, prediction.expected, prediction.allowed
+    of_model = prediction.bands_hz, prediction.expected, prediction.allowed, prediction.units
     return PredictionCheck(record.name, tuple(names), outputs.size, shares[:, 0], shares[:, 1:], *of_model)
 
 

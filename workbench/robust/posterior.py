@@ -28,7 +28,7 @@ LIKELY = 0.01  # probability above which an alternative set is drawn too
 MOST_TRIES = 20  # draws until one is a feasible rig
 EXPLAINED = ("none", "explained")  # outcomes without an unexplained gap
 LATER = ("places_of_inputs", "places_of_outputs", "quantities_of_outputs", "damping_rates")  # not in early verdicts
-WHAT_DRAWS = "draws, the number of samples of the uncertain rig,"
+WHAT_DRAWS = "draws, the number of realisations of the uncertain rig,"
 
 
 @dataclass(frozen=True, eq=False)

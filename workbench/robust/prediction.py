@@ -8,10 +8,12 @@ import numpy as np
 
 from workbench.arguments import number, whole
 from workbench.arrays import Floats
+from workbench.cases.case import in_units
 from workbench.design.estimation.digital import DigitalController
 from workbench.design.loop.rig_loop import LoopRun, LoopTest, named, run_loops
 from workbench.gap.report.verdict import Verdict
 from workbench.records.record import Channel, Record
+from workbench.records.units import SI, Units
 from workbench.renamed import former_arguments
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import RandomForce
@@ -50,6 +52,7 @@ class Prediction(Printed):
         name: of the test or controller.
         notes: warnings and remarks.
         allowed: rms of the unexplained residual over that of the readings; the bands include it.
+        units: of time, of frequencies and of the channels.
     """
 
     time: Floats
@@ -66,6 +69,7 @@ class Prediction(Printed):
     name: str = "prediction"
     notes: tuple[str, ...] = ()
     allowed: float = 0.0
+    units: Units = SI
 
     def __post_init__(self) -> None:
         freeze(self, "time", "median", "lower", "upper", "frequencies_hz", "bands_hz", "expected")
@@ -113,6 +117,7 @@ def predict(
     noise_std: Sequence[float] | Floats | None = None,
     draws: int = DRAWS,
     seed: int = 0,
+    units: Units | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> Prediction:
     """Predicted sensor outputs of a test, from rest, with 95 % bands over time and frequency.
@@ -128,6 +133,7 @@ def predict(
         noise_std: (n_outputs,) of the readings; by default that of the verdict, else that of the sensors.
         draws: of the rig.
         seed: of the draws and of the noise.
+        units: of the results; by default those of the verdict.
         progress: called with (text, share done).
 
     Raises:
@@ -153,16 +159,18 @@ def predict(
         truths.append(truth)
     time = np.asarray(start + period * np.arange(n_samples), float)
     name = inputs.name if isinstance(inputs, Record) else "prediction"
-    banded = _banded(uncertain, _with_noise(uncertain.rig, noise).sensors, truths, time, rng, name)
-    return replace(banded, notes=(*banded.notes, *_above_nyquist(uncertain.rig.modes, period)))
+    named_units = _units(rig, units)
+    banded = _banded(uncertain, _with_noise(uncertain.rig, noise).sensors, truths, time, rng, name, named_units)
+    return replace(banded, notes=(*banded.notes, *_above_nyquist(uncertain.rig.modes, period, named_units)))
 
 
-def _above_nyquist(modes: Modes, period: float) -> tuple[str, ...]:
+def _above_nyquist(modes: Modes, period: float, units: Units) -> tuple[str, ...]:
     """A note on the modes above the Nyquist frequency."""
+    hertz = units.named("Hz")
     fast = [f"{f:.4g}" for f in modes.frequencies_hz if f > 0.5 / period]
     note = (
-        f"Modes at {', '.join(fast)} Hz lie above the Nyquist frequency of {0.5 / period:.4g} Hz: the inputs do not"
-        " contain their excitation between samples, unless they were held as input_hold says; sample faster."
+        f"Modes at {', '.join(fast)} {hertz} lie above the Nyquist frequency of {0.5 / period:.4g} {hertz}: the inputs"
+        " do not contain their excitation between samples, unless they were held as input_hold says; sample faster."
     )
     return (note,) if fast else ()
 
@@ -176,6 +184,7 @@ def predict_loop(
     noise_std: Sequence[float] | Floats | None = None,
     draws: int = DRAWS,
     seed: int = 0,
+    units: Units | None = None,
 ) -> Prediction:
     """Predicted readings of a controller's sensors in a closed-loop test, with 95 % bands over time and frequency.
 
@@ -189,6 +198,7 @@ def predict_loop(
         noise_std: (n_outputs,) of all the rig's sensors; by default that of the verdict, else that of the sensors.
         draws: of the rig.
         seed: of the draws and of the noise.
+        units: of the results; by default those of the verdict.
 
     Raises:
         TypeError: no verdict, no sampled controller, no test, or an argument that is no number.
@@ -205,7 +215,13 @@ def predict_loop(
     truths = [_loop_truth(drawn, run, controller, test.sample_time) for drawn, run in zip(rigs, runs, strict=True)]
     sensors = _with_noise(uncertain.rig, noise).sensors
     read_by = [named(sensors, name) for name in controller.sensors]
-    return _banded(uncertain, read_by, truths, test.time, np.random.default_rng([seed, 1]), controller.name)
+    generator = np.random.default_rng([seed, 1])
+    return _banded(uncertain, read_by, truths, test.time, generator, controller.name, _units(rig, units))
+
+
+def _units(rig: Verdict | UncertainRig, units: Units | None) -> Units:
+    """The units of the results: as given, else of the verdict, else SI."""
+    return units or (rig.units if isinstance(rig, Verdict) else SI)
 
 
 def _uncertain(rig: Verdict | UncertainRig, noise_std: Sequence[float] | Floats | None) -> tuple[UncertainRig, Floats]:
@@ -263,6 +279,7 @@ def _banded(
     time: Floats,
     rng: np.random.Generator,
     name: str,
+    units: Units,
 ) -> Prediction:
     """The prediction with its bands, from the noise-free readings (n_outputs, n_samples) of each draw.
 
@@ -279,11 +296,11 @@ def _banded(
     notes, diverging = [], len(drawn) - len(truths)
     if diverging > len(drawn) // 10:
         raise ValueError(
-            f"{diverging} of {len(drawn)} samples of the uncertain rig diverge in this test; predict a test of less"
+            f"{diverging} of {len(drawn)} draws of the uncertain rig diverge in this test; predict a test of less"
             " excitation, or measure more first"
         )
     if diverging:
-        notes.append(f"{diverging} of {len(drawn)} samples diverge and are left out.")
+        notes.append(f"{diverging} of {len(drawn)} draws diverge and are left out.")
     if not uncertain.explained:
         notes.append(
             "The diagnosis leaves the gap unexplained: the bands allow for an error of"
@@ -295,10 +312,10 @@ def _banded(
         readings[i] = _read(truth, sensors, rng)
     sizes = np.array([amplitudes(reading) for reading in readings])
     middle, least, most = np.quantile(sizes, QUANTILES, axis=0, method="weibull")
-    channels = tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in sensors)
+    channels = in_units([Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in sensors], units)
     in_time = time, channels, median, lower, upper
     in_frequency = frequencies, middle, least, most, bands, np.zeros((0, len(sensors), 1 + len(bands)))
-    prediction = Prediction(*in_time, *in_frequency, name, tuple(notes), uncertain.unexplained)
+    prediction = Prediction(*in_time, *in_frequency, name, tuple(notes), uncertain.unexplained, units)
     return replace(prediction, expected=np.array([prediction.coverage(reading) for reading in readings]))
 
 

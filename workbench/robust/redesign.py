@@ -65,7 +65,7 @@ def redesign(
         sample_time: of the controller, s; by default that of the records.
         impulse_at: place of the test's impulse; by default that of the hammer, or of the first actuator.
         test: instead of the impulse.
-        draws: samples of the uncertain rig on which both are verified.
+        draws: number of draws of the uncertain rig on which both are verified.
         seed: of the draws and of the sensors' noise.
         placement: whether to optimise the places of the actuators too.
         criterion: "cost" or "settling", see `Redesign`; by default "cost" for a law that minimises a cost, and
@@ -115,10 +115,10 @@ def redesign(
             break
         modes = modes_in_motion(corrected, after)
     controlled = search.loop.law.controlled
-    progress("verification on the samples", 0.4)
+    progress("verification on the draws", 0.4)
     rigs = drawn_with_errors(uncertain, draws, seed)
     old = verify(rigs, present, test, controlled=controlled, margin_rig=corrected)
-    progress("verification on the samples", 0.65)
+    progress("verification on the draws", 0.65)
     new = verify(rigs, search.controller, test, controlled=controlled, margin_rig=corrected)
     progress("placement of actuators", 0.9)
     moved = relocated(search.loop, test, units) if placement else None
@@ -175,7 +175,7 @@ def _notes(uncertain: UncertainRig, rig: Rig, draws: int, *, as_wanted: bool) ->
     notes = []
     if not as_wanted:
         notes.append(
-            "Even with perfect actuators and sensors the controlled modes do not settle within the test, so the"
+            "Even with ideal actuators and sensors the controlled modes do not settle within the test, so the"
             " controllers are judged by vibration and effort; give a longer test to judge them by settling."
         )
     if any(a.crosstalk for a in rig.actuators):

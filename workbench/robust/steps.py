@@ -21,7 +21,7 @@ from workbench.robust.small_motion import loop_poles
 from workbench.robust.verification import settling
 
 DIVERGENT = 1e3  # loss above which the motion is called divergent
-LOSS = "loss: vibration and effort above those with perfect actuators and sensors"
+LOSS = "performance loss: summed relative excess of vibration and effort over ideal actuators and sensors"
 LEAST_SHOWN = 1e-4  # loss below which its size is not stated
 GAINED = 0.005  # least reduction of the loss by a step; least change of the cost for a change of the controller
 # factors of the control weight, and of the noise of the Kalman filter, that are tried
@@ -47,11 +47,11 @@ class Step:
         what: in words, with the compensated values.
         vibration, effort, work: ∫ of the energy of all modes, ∫ FᵀF dt and W = Σ_r |W_r|, on the corrected rig under
             test, with this step and those kept before.
-        excess: relative excess over the redesigned law with perfect actuators and sensors: of the vibration of
+        excess: relative excess over the redesigned law with ideal actuators and sensors: of the vibration of
             controlled modes, of that of residual modes (over that of all modes), and of the effort. Each is 0 or more,
             so that a gain in one cannot offset a loss in another.
         loss: sum of the three.
-        cost: J / J₀ - 1, J₀ of the same perfect loop; see `Redesign.criterion`. Below zero the loop is better.
+        cost: J / J₀ - 1, J₀ of the same ideal loop; see `Redesign.criterion`. Below zero the loop is better.
         kept: whether the step reduces the loss or the cost enough to be kept.
     """
 
@@ -249,7 +249,7 @@ def _perfect(a: Actuator) -> Actuator:
 def force_weight(run: LoopRun, controlled: Sequence[int]) -> float:
     """ρ of the cost 2 ∫ energy dt + ρ ∫ FᵀF dt for which both terms are equal over the controlled modes.
 
-    The run is that of the reference loop, with perfect actuators and sensors.
+    The run is that of the reference loop, with ideal actuators and sensors.
     """
     return 2.0 * _vibration(run, controlled) / max(run.effort, 1e-300)
 

@@ -1,4 +1,4 @@
-"""Monte Carlo verification of a controller on samples of the uncertain rig, with its small-gain margin."""
+"""Monte Carlo verification of a controller on draws of the uncertain rig, with its small-gain margin."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -30,7 +30,7 @@ QUANTILES = (0.5, 0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL)
 
 @dataclass(frozen=True, eq=False)
 class Verification:
-    """The performance of a controller on samples of an uncertain rig.
+    """The performance of a controller on draws of an uncertain rig.
 
     Attributes:
         stable: (n_draws,) whether the linearised loop is stable and the motion under test does not grow; with forces
@@ -84,7 +84,7 @@ class Verification:
 
     @property
     def worst_damping(self) -> np.ndarray:
-        """(n_draws,) the least damping ratio of any mode."""
+        """(n_draws,) the minimum damping ratio of all modes."""
         return np.asarray(self.damping.min(axis=1))
 
     @property
@@ -141,7 +141,7 @@ def verify(
     seed: int = 0,
     margin_rig: Rig | None = None,
 ) -> Verification:
-    """The performance of a controller on samples of an uncertain rig under a test, with all nonlinear elements.
+    """The performance of a controller on draws of an uncertain rig under a test, with all nonlinear elements.
 
     The unexplained share of a diagnosis is drawn too, as an error of each sensor's gain within ± that share.
 

@@ -83,16 +83,15 @@ def case_page_content(folder: Path) -> PageContent:
     ]
     level = f"input rms [{units_of_inputs(rig.actuators, case.units)}]"
     modes = list(zip(range(1, rig.modes.n_modes + 1), rig.modes.frequencies_hz.tolist(), rig.modes.zeta.tolist()))
+    responses = plot_responses({"nominal": rig}, records, time_unit=case.units.time)
+    rate, frequency = map(case.units.named, ("sample rate [Hz]", "frequency [Hz]"))
     return PageContent(
         title=f"Case {case.name}, before any diagnosis",
         lines=(f"{len(rig.actuators)} inputs, {len(rig.sensors)} sensors, {len(records)} records.",),
-        blocks=[
-            *moving_modes(rig, {"nominal": rig.modes}, units=case.units),
-            block(plot_responses({"nominal": rig}, records), caption),
-        ],
+        blocks=[*moving_modes(rig, {"nominal": rig.modes}, units=case.units), block(responses, caption)],
         tables=[
-            ("Records", ("record", "use", "samples", "sample rate [Hz]", level), rows),
-            ("Nominal modes", ("mode", "frequency [Hz]", "damping ratio"), modes),
+            ("Records", ("record", "use", "samples", rate, level), rows),
+            ("Nominal modes", ("mode", frequency, "damping ratio"), modes),
         ],
         inputs=case_inputs(folder),
         made_by=f"workbench report {folder}",
@@ -233,7 +232,8 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
         ]
         for one in through
     ]
-    heads = ("controller", "decay rate, -max Re λ [1/s]", "loop", "limiting residual mode, Re λ", "path", ROBUSTNESS)
+    rate = units.named("decay rate, -max Re λ [1/s]")
+    heads = ("controller", rate, "loop", "limiting residual mode, Re λ", "path", ROBUSTNESS)
     filled = [i for i in range(len(heads)) if i < 3 or any(row[i] != "" for row in sensed)]
     sensed = [[row[i] for i in filled] for row in sensed]
     seen = {one["design"]: _poles_of(one) for one in through if "poles_real" in one}

@@ -443,6 +443,9 @@ def test_channels_keep_their_names_in_words():
         label_in_words("bouc_wen") == "hysteretic spring (Bouc-Wen)"
         and label_in_words("point_mass[x = 1]") == "point mass (x = 1)"
     )
+    assert label_in_words("modulus_error") == "overall stiffness error"
+    assert label_in_words("two_way_friction") == "asymmetric Coulomb friction"
+    assert label_in_words("swapped_inputs[F1, F2]") == "exchange of inputs (F1, F2)"
 
 
 @pytest.mark.parametrize("offset", [-2.0, 0.0])

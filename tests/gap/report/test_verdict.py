@@ -116,7 +116,7 @@ def test_errors_that_no_careful_model_has_are_not_called_small(hinged_rig, recor
 
 @pytest.mark.parametrize(
     ("nominal", "rest"),
-    [(0.93, "93 % are small errors of the model (damping 9 %), 7.0 % remain"), (0.0, "100 % remain")],
+    [(0.93, "93 % is due to small errors of the model (damping 9 %), 7.0 % remains"), (0.0, "100 % remains")],
 )
 def test_what_errors_close_is_said_where_no_effect_is_near(hinged_rig, record_of, nominal, rest):
     rig, rng = hinged_rig(3), np.random.default_rng(5)
@@ -204,7 +204,7 @@ def test_errors_beside_a_gap_that_is_still_there_have_no_sizes(hinged_rig, recor
     shares = {"nominal": 0.16, "unexplained": 0.84, "noise": 0.0}
     budget = replace(found.budget, **shares, errors={"damping_percent": 32.0})
     sentence = replace(found, budget=budget, outcome="unknown", effects=()).sentence
-    assert sentence.endswith("explains the gap; 16 % may be errors of the model, 84 % remain unexplained.")
+    assert sentence.endswith("explains the gap; 16 % may be due to errors of the model, 84 % remains unexplained.")
 
 
 def test_noise_that_was_not_stated_is_not_said_to_be(hinged_rig, record_of):

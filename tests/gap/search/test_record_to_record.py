@@ -110,7 +110,9 @@ def test_a_record_that_no_fit_has_seen_is_accounted_for_and_not_predicted(rig):
 def test_words_say_by_how_much_records_differ_and_which_two_most():
     found = RecordToRecord("stiffness", {"low": 0.004, "mid": -0.006, "high": 0.002})
     assert found.spread == pytest.approx(np.std([0.004, -0.006, 0.002], ddof=1))
-    assert found.words == "0.53 %: record low is 1 % stiffer than record mid"
+    assert found.words == "standard deviation 0.53 %: the structure is 1 % stiffer in record low than in record mid"
+    loaded = RecordToRecord("axial load", {"low": 4.0, "mid": -6.0, "high": 2.0})
+    assert loaded.words == "standard deviation 5.3 N: the axial load is 10 N higher in record low than in record mid"
 
 
 @pytest.mark.slow
@@ -148,8 +150,8 @@ def test_a_hidden_effect_is_named_beside_a_stiffness_that_differs(rig, at):
     records = [of_stiffness(rig, name, hidden) for name in LEVELS]
     verdict = diagnose(rig, records[:3], validation=records[3:])
     assert [e["kind"] for e in verdict.to_json()["effects"]] == [e["kind"] for e in hidden]
-    assert "from record to record" in verdict.sentence
-    assert "record low is 1 % stiffer than record mid" in verdict.sentence
+    assert ("varies from record to record" if at is None else "stiffness between records") in verdict.sentence
+    assert "the structure is 1 % stiffer in record low than in record mid" in verdict.sentence
     budget = verdict.budget
     assert sum(budget.effects.values()) + budget.nominal + budget.unexplained + budget.noise == pytest.approx(1.0)
     assert budget.unexplained < 0.01 and budget.effects["stiffness_record_to_record"] > 0.001

@@ -406,7 +406,10 @@ def names_in(target: Any) -> tuple[str, ...]:
 SPELLINGS = (
     ("bouc wen", "hysteretic spring (Bouc-Wen)"),
     ("coulomb", "Coulomb"),
-    ("two way friction", "direction-dependent friction"),
+    ("two way friction", "asymmetric Coulomb friction"),
+    ("modulus error", "overall stiffness error"),
+    ("swapped inputs", "exchange of inputs"),
+    ("swapped outputs", "exchange of outputs"),
     ("one sided", "one-sided"),
     ("crosstalk", "cross-talk"),
 )

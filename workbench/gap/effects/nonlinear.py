@@ -233,7 +233,7 @@ def _direction_dependent(friction: Effect, offset: float = 0.0) -> Effect:
 
 
 def _merged_with_bias(friction: Effect, other: Effect) -> Effect | None:
-    """Friction and a constant force as direction-dependent friction, which an offset of a drive looks like."""
+    """Friction and a constant force as asymmetric friction, which an offset of a drive looks like."""
     if other.kind is not ACTUATOR_BIAS or abs(other.values["force"]) >= friction.values["force"]:
         return None
     return _direction_dependent(friction, -other.values["force"])
@@ -334,7 +334,7 @@ def _two_way_starts(place: ForceAndMotion) -> Iterator[dict[str, float]]:
 
 
 def _two_way_values(force: float, offset: float, speed: float) -> dict[str, float]:
-    """Values of direction-dependent friction of a mean force and half the difference of both directions, N."""
+    """Values of asymmetric friction of a mean force and half the difference of both directions, N."""
     return {"force_forward": force + offset, "force_backward": force - offset, "smoothing_speed": speed}
 
 
@@ -369,7 +369,7 @@ TWO_WAY_FRICTION = Kind(
     force_laws={"velocity": _two_way_law},
     numbers=_stated_numbers,
     without_negligible=_with_negligible_speed,
-    phrase="direction-dependent Coulomb friction",
+    phrase="asymmetric Coulomb friction",
 )
 
 

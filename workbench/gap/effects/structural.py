@@ -414,13 +414,13 @@ TRUNCATED_MODES = Kind(
     apply=solved_once(_with_modes),
     starts=lambda reconstruction, _: [{}],
     targets=lambda rig: () if rig.structure is None else tuple(range(rig.modes.n_modes + 1, rig.modes.n_modes + 17)),
-    phrase="modes left out of the model",
+    phrase="truncation of the modal model",
     simpler=_with_one_mode_fewer,
     more_general=_with_more_modes,
     exclusive=True,
     adds_modes=True,
     numbers=lambda truncation, rig: {"kept": rig.modes.n_modes, "needed": truncation.target},
-    remark=lambda truncation, rig: f"{truncation.target} are needed, {rig.modes.n_modes} are kept",
+    remark=lambda truncation, rig: f"{truncation.target} modes needed, {rig.modes.n_modes} kept",
 )
 
 

@@ -369,11 +369,12 @@ class RecordToRecord:
 
     @property
     def words(self) -> str:
-        """The spread and the extreme records, such as: 0.8 %: record low is 1.1 % stiffer than record high."""
+        """Its spread and extremes: standard deviation 0.8 %: the structure is 1.1 % stiffer in record a than in b."""
         least, most = (pick(self.values, key=lambda name: self.values[name]) for pick in (min, max))
         difference = self._in_unit(self.values[most] - self.values[least])
-        how = f"has {difference} more than" if self.parameter == TENSION else f"is {difference} stiffer than"
-        return f"{self._in_unit(self.spread)}: record {most} {how} record {least}"
+        what, how = (TENSION, "higher") if self.parameter == TENSION else ("structure", "stiffer")
+        extremes = f"the {what} is {difference} {how} in record {most} than in record {least}"
+        return f"standard deviation {self._in_unit(self.spread)}: {extremes}"
 
     def _in_unit(self, size: float) -> str:
         return f"{size:.2g} {self.force}" if self.parameter == TENSION else f"{100.0 * size:.2g} %"

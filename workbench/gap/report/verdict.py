@@ -139,7 +139,7 @@ class Verdict:
             return ""
         at = place_in_words(place.at, dict.fromkeys(COORDINATES, place.at_std))
         if self.is_located:
-            return f"{at}, of the unmodelled point force, without a force law"
+            return f"{at} (unmodelled point force, no force law assumed)"
         elsewhere = explained and self._acting and not self._agrees(self._acting)
         if place.is_single_force is not False or elsewhere:
             return ""
@@ -209,7 +209,7 @@ class Verdict:
         if self.record_to_record is not None:
             varying = self.record_to_record
             share = _percent(self.budget.effects.get(varying.label, 0.0))
-            how = f"The {varying.parameter} differs from record to record by {varying.words}"
+            how = f"The {varying.parameter} varies from record to record ({varying.words})"
             return f"{how}. This causes {share} of the gap{self._rest}."
         if self.budget.errors_are_small:
             return f"There is no gap beyond small errors of the nominal model{self._errors_in_words} and noise."
@@ -220,13 +220,13 @@ class Verdict:
 
     @property
     def _disagreement(self) -> str:
-        """The validation records that disagree, such as: validation record high disagrees by 156 % of its signal."""
+        """The residuals of the validation records that disagree, over their signals, and the remedy."""
         sizes = {} if self.shrinkage is None else {n: _percent(self.shrinkage.after[n]) for n in self.disagreeing}
         if len(sizes) == 1:
             ((name, size),) = sizes.items()
-            return f"validation record {name} disagrees by {size} of its signal: fit it too"
-        each = joined_in_words([f"{name} by {size}" for name, size in sizes.items()])
-        return f"validation records disagree, {each} of their signals: fit them too"
+            return f"the residual of validation record {name} is {size} of its signal: include it in the fit"
+        names, each = joined_in_words(list(sizes)), joined_in_words(list(sizes.values()))
+        return f"the residuals of validation records {names} are {each} of their signals: include them in the fit"
 
     def _share_of(self, effect: Effect) -> float:
         """Share of the gap that an effect causes; summed over sensors if it stands for all of them."""
@@ -243,12 +243,12 @@ class Verdict:
         parts, varying = [], self.record_to_record
         if varying is not None and self.shows_gap:
             share = _percent(self.budget.effects.get(varying.label, 0.0))
-            parts.append(f"{share} are differences of {varying.parameter} from record to record ({varying.words})")
+            parts.append(f"{share} is due to the variation of {varying.parameter} between records ({varying.words})")
         if self.budget.nominal >= SHOWN:
-            are = "may be" if self._is_unexplained else "are"
-            parts.append(f"{_percent(self.budget.nominal)} {are} {self._errors_named}")
+            due = "may be due to" if self._is_unexplained else "is due to"
+            parts.append(f"{_percent(self.budget.nominal)} {due} {self._errors_named}")
         if self.budget.unexplained >= SHOWN:
-            parts.append(f"{_percent(self.budget.unexplained)} remain unexplained")
+            parts.append(f"{_percent(self.budget.unexplained)} remains unexplained")
         if self.budget.noise >= SHOWN:
             parts.append(f"{_percent(self.budget.noise)} is noise")
         return "; " + ", ".join(parts) if parts else ""

@@ -35,17 +35,17 @@ def redesign_page(found: Redesign, path: Path, *, name: str, record: Record, fol
         at = found.uncertain_rig.rig.modes.domain.text(test.impulse_at, 4)
         excitation = f"an impulse of {test.impulse:.3g} {found.units.named('N s')} at {at}"
     compared = (
-        f"Both controllers after {excitation}, on the same samples of the uncertain model, including all"
+        f"Both controllers after {excitation}, on the same draws of the uncertain model, including all"
         " dead zones, delays, friction and noise. The controller with the lower curve is better; a wide band means"
         " that the records leave much uncertain."
     )
     blocks.append(block(plot_redesign(found), compared))
     if max(s.loss for s in found.steps) > NEGLIGIBLE:
-        caption = f"From the present controller to the redesigned one, step by step: the {LOSS}."
+        caption = f"From the present controller to the redesigned one, step by step. {LOSS[0].upper()}{LOSS[1:]}."
         blocks.append(block(plot_steps(found), caption))
     steps = [(s.name, s.what, s.lost, s.in_new_controller) for s in found.steps]
     tables: list[Table] = [
-        ("On the same samples: median (95 % interval)", ("", "present", "redesigned"), _figures(found)),
+        ("On the same draws: median (95 % interval)", ("", "present", "redesigned"), _figures(found)),
         ("Steps", ("step", "change", "performance loss", "in the new controller"), steps),
     ]
     used = found.verification if found.improves else found.present_verification
@@ -66,17 +66,17 @@ def redesign_page(found: Redesign, path: Path, *, name: str, record: Record, fol
 
 def _figures(found: Redesign) -> list[tuple[str, ...]]:
     old, new = found.present_verification, found.verification
-    rows: list[tuple[str, ...]] = [("stable samples", *(f"{p.n_stable} of {p.n_draws}" for p in (old, new)))]
+    rows: list[tuple[str, ...]] = [("stable draws", *(f"{p.n_stable} of {p.n_draws}" for p in (old, new)))]
     for r in found.controlled:
         rows.append((f"damping ratio of mode {r + 1} [%]", *(_rounded(100.0 * p.damping[:, r]) for p in (old, new))))
-    rows.append(("least damping ratio of any mode [%]", *(_rounded(100.0 * p.worst_damping) for p in (old, new))))
+    rows.append(("minimum damping ratio of all modes [%]", *(_rounded(100.0 * p.worst_damping) for p in (old, new))))
     each = {
         "controlled_settling": "settling time of the controlled modes [s]",
-        "settling": "of all modes [s]",
+        "settling": "settling time of all modes [s]",
         "peak_force": "peak force [N]",
         "stroke": "largest displacement at an actuator [m]",
         "controlled_work": "work in controlled modes, W_C [J]",
-        "residual_work": "in residual modes, W_R [J]",
+        "residual_work": "work in residual modes, W_R [J]",
         "effort": "effort, ∫ FᵀF dt [N² s]",
     }
     for name, words in each.items():
