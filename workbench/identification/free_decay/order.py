@@ -71,7 +71,7 @@ class OrderSettings:
     whitening_rounds: int = 2  # alternations between noise spectrum and modes
     # Modes that whitening removed are true, and stay, if they reduce the energy of the residual to this share or less;
     # modes fitted to coloured noise reduce it by a part only.
-    max_residual_ratio: float = 0.1
+    max_restored_ratio: float = 0.1
     # consecutive candidates below the threshold, and candidates that split a mode, after which the search ends
     max_weak: int = 2
     max_splits: int = 6
@@ -214,7 +214,7 @@ def _identify_stepwise(
         all_modes = np.append(fewer.poles, model.poles[other.lost(model.poles, fewer.poles)])
         if explained:
             share, share_of_fewer = (_residual_share(records, poles) for poles in (all_modes, fewer.poles))
-            if share < ORDER.max_residual_ratio * share_of_fewer:
+            if share < ORDER.max_restored_ratio * share_of_fewer:
                 fewer = other.fitted(all_modes, fewer.weights)
         problem, model = other, fewer
     problem.time_limit = time_limit
