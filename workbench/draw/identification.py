@@ -45,9 +45,9 @@ def _stays(modes: SampledModes, stayed: SampledModes) -> Flags:
     """Which modes agree in frequency and shape with one that stays, and decay, (n_modes,)."""
     if not stayed.n_modes:
         return np.zeros(modes.n_modes, bool)
-    near = np.abs(modes.omega[:, None] / stayed.omega - 1.0) <= STABILITY.frequency
-    alike = mac(modes.shapes, stayed.shapes) >= STABILITY.shape
-    return np.asarray((near & alike).any(axis=1) & (modes.zeta > 0.0) & (modes.zeta < STABILITY.most_damped))
+    near = np.abs(modes.omega[:, None] / stayed.omega - 1.0) <= STABILITY.frequency_tolerance
+    alike = mac(modes.shapes, stayed.shapes) >= STABILITY.min_mac
+    return np.asarray((near & alike).any(axis=1) & (modes.zeta > 0.0) & (modes.zeta < STABILITY.max_damping))
 
 
 def plot_standard_errors(refined: RefinedModes) -> Figure:

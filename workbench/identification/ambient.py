@@ -34,16 +34,15 @@ from workbench.threads import one_blas_thread
 class AmbientSettings:
     """Constants of the output-only identification."""
 
-    most_references: int = 4
-    least_length: int = 40  # of a record, in longest lags
-    most_directions: int = 6  # combinations of outputs that modes are identified from
-    above_errors: float = 4.0  # least energy of the correlation functions at a lag, over that of their errors
-    least_lags: int = 64
-    # largest standard error of a mode's frequency over √(ζω/T), that of a single mode without noise; poles that fit
-    # noise have a larger one
-    most_error: float = 5.0
+    max_references: int = 4
+    min_length: int = 40  # of a record, in longest lags
+    max_directions: int = 6  # combinations of outputs that modes are identified from
+    min_energy_ratio: float = 4.0  # of the correlation functions at a lag to their errors
+    min_lags: int = 64
+    # standard error over √(ζω/T), that of a single mode without noise; poles that fit noise have a larger one
+    max_frequency_error: float = 5.0
     level_parts: int = 60  # of a record, whose levels are compared
-    uneven: float = 3.5  # rms of the strongest part over the median of all, which steady forces do not reach
+    max_level_ratio: float = 3.5  # rms of the strongest part over the median of all, which steady forces do not reach
 
 
 AMBIENT = AmbientSettings()
@@ -146,7 +145,7 @@ def identify_ambient(
     if n_modes is None:
         found = subspace.with_errors([mode for mode in stable if mode.statistic > limit], time_limit)
         resolution = 1.0 / (record.n_samples * record.sample_time)
-        most_variance = AMBIENT.most_error**2 * resolution
+        most_variance = AMBIENT.max_frequency_error**2 * resolution
         found = [mode for mode in found if mode.variance[1, 1] < most_variance * abs(mode.pole.real)]
     else:
         found = subspace.with_errors(sorted(stable, key=lambda mode: -mode.statistic)[:n_modes], time_limit)
@@ -167,12 +166,12 @@ def identify_ambient(
 
 
 def _combinations(record: Record) -> np.ndarray:
-    """The outputs scaled to unit variance or, of more than `AMBIENT.most_directions`, their principal components."""
+    """The outputs scaled to unit variance or, of more than `AMBIENT.max_directions`, their principal components."""
     outputs = np.asarray(record.outputs / record.outputs.std(axis=1, keepdims=True))
-    if record.n_outputs <= AMBIENT.most_directions:
+    if record.n_outputs <= AMBIENT.max_directions:
         return outputs
     centred = outputs - outputs.mean(axis=1, keepdims=True)
-    vectors = np.linalg.eigh(centred @ centred.T)[1][:, -AMBIENT.most_directions :]
+    vectors = np.linalg.eigh(centred @ centred.T)[1][:, -AMBIENT.max_directions :]
     return np.asarray(vectors.T @ centred)
 
 
@@ -182,7 +181,7 @@ def _uneven_level(record: Record) -> tuple[str, ...]:
     parts = np.array_split(centred / centred.std(axis=1, keepdims=True), AMBIENT.level_parts, axis=1)
     rms = np.sqrt([float((part**2).mean()) for part in parts])
     ratio = float(rms.max() / np.median(rms))
-    if ratio < AMBIENT.uneven:
+    if ratio < AMBIENT.max_level_ratio:
         return ()
     return (
         f"the motion is {ratio:.2g} times as strong in some parts of the record as in most: modes may be missing, and"
@@ -200,16 +199,16 @@ def _shapes(decays: Sequence[Record], poles: np.ndarray) -> np.ndarray:
 def _lags(record: Record, max_lag: float | None, references: Sequence[str] | None) -> tuple[int, list[int]]:
     """Number of lags, and indices of the references among the outputs."""
     if references is None:
-        strongest = np.argsort(-record.outputs.std(axis=1))[: AMBIENT.most_references]
+        strongest = np.argsort(-record.outputs.std(axis=1))[: AMBIENT.max_references]
         rows = sorted(int(j) for j in strongest)
     else:
         rows = [record.output_names.index(name) for name in record.select_outputs(references).output_names]
-    width = AMBIENT.least_lags
-    most, least = record.n_samples // AMBIENT.least_length, width // 4
+    width = AMBIENT.min_lags
+    most, least = record.n_samples // AMBIENT.min_length, width // 4
     if most < least:
         raise ValueError(
             f"record {record.name!r} has {record.n_samples} samples; modes of random vibration take at least"
-            f" {AMBIENT.least_length * least}: measure longer"
+            f" {AMBIENT.min_length * least}: measure longer"
         )
     lags = most if max_lag is None else round(max_lag / record.sample_time)
     if not least <= lags <= most:
@@ -223,7 +222,7 @@ def _lags(record: Record, max_lag: float | None, references: Sequence[str] | Non
         energy = (correlations / correlations.std(axis=2, keepdims=True)) ** 2
         windows = energy.sum(axis=(0, 1))[: 4 * lags // width * width].reshape(-1, width).mean(axis=1)
         errors = np.median(windows[windows.size // 2 :])
-        lags = min(lags, width * max(1, int(np.argmax(np.r_[windows, 0.0] < AMBIENT.above_errors * errors))))
+        lags = min(lags, width * max(1, int(np.argmax(np.r_[windows, 0.0] < AMBIENT.min_energy_ratio * errors))))
     return lags, rows
 
 

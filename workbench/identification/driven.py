@@ -350,7 +350,7 @@ def _without_artefacts(
     while fit.poles.size > 1:
         std = np.sqrt(np.diag(pole_covariance(fit))).reshape(2, -1)
         modes = SampledModes.of_poles(fit.poles, fit.amplitudes, data.places)
-        good = credible(modes, std[0], std[1], data.highest) & (modes.zeta <= SELECTION.most_damped)
+        good = credible(modes, std[0], std[1], data.highest) & (modes.zeta <= SELECTION.max_damping)
         if good.all() or not good.any():
             break
         out += list(modes.frequencies_hz[~good])
@@ -359,7 +359,7 @@ def _without_artefacts(
         return selected, ()
     which = ", ".join(f"{f:.4g}" for f in sorted(out))
     remark = (
-        f"poles left out (negative damping, damping ratio above {SELECTION.most_damped:g}, undetermined frequency, or"
+        f"poles left out (negative damping, damping ratio above {SELECTION.max_damping:g}, undetermined frequency, or"
         f" above the Nyquist frequency): {which} Hz"
     )
     return selected.refitted(fit), (remark,)

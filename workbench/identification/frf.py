@@ -46,17 +46,17 @@ from workbench.threads import one_blas_thread
 class FrfSettings:
     """Constants of the stages of an identification from FRFs."""
 
-    most_lines: int = 1500  # that are fitted together; more are fitted band by band
-    band: int = 600  # lines of a band
-    overlap_lines: int = 75  # lines added beyond each edge of a band
-    lines_a_mode: int = 50  # least number of lines of a band per mode
-    most_error: float = 0.01  # largest relative standard error of the frequency of a mode that is reported
-    strongest: int = 4  # modes for the first estimate of the noise
+    max_lines: int = 1500  # that are fitted together; more are fitted band by band
+    band_lines: int = 600
+    overlap_lines: int = 75  # added beyond each edge of a band
+    lines_per_mode: int = 50  # of a band, at least
+    max_frequency_error: float = 0.01  # relative standard error of a mode that is reported
+    noise_modes: int = 4  # for the first estimate of the noise
     noise_rounds: int = 2  # estimates of the noise
-    acausal: float = 10.0  # least ratio of the energy of impulse responses before the impulse to that after it
-    disagrees: float = 1.5  # least factor between estimated and stated noise that is remarked
-    resolved: float = 4.0  # lines per half-power bandwidth above which Hann's window adds less than 5 % of damping
-    alike: float = 0.2  # rms log ratio of two estimates of the noise that agree
+    min_acausal_ratio: float = 10.0  # of the energy of impulse responses before the impulse to that after it
+    min_noise_ratio: float = 1.5  # factor between estimated and stated noise that is remarked
+    bandwidth_lines: float = 4.0  # of the half-power bandwidth, above which Hann's window adds under 5 % of damping
+    noise_tolerance: float = 0.2  # rms log ratio of two estimates of the noise that agree
 
 
 FRF = FrfSettings()
@@ -182,7 +182,7 @@ def identify_frf(
     h = h.conj() if turned else h
     options = SelectionOptions(max_modes, false_alarm, time_limit)
     estimate, s = _in_bands(h, f, noise, channels, options), 2j * np.pi * f
-    for least in (CLOCKS.phase, CLOCKS.refined):
+    for least in (CLOCKS.min_phase, CLOCKS.min_refined_phase):
         late = _output_delays(estimate, channels, least)
         if not late.any() or time_limit.spent("search for delays of the outputs"):
             break
@@ -220,8 +220,8 @@ def identify_frf(
 def _in_bands(
     h: np.ndarray, f: np.ndarray, noise: np.ndarray | None, channels: Sequence[Channel], options: SelectionOptions
 ) -> FrfModes:
-    """The modes of all lines; more than `FRF.most_lines` are fitted band by band."""
-    n_bands, lines_a_mode = (1, 3) if f.size <= FRF.most_lines else (-(-f.size // FRF.band), FRF.lines_a_mode)
+    """The modes of all lines; more than `FRF.max_lines` are fitted band by band."""
+    n_bands, lines_a_mode = (1, 3) if f.size <= FRF.max_lines else (-(-f.size // FRF.band_lines), FRF.lines_per_mode)
     share = f.size / n_bands
 
     def band(k: int, band_budget: TimeLimit) -> FrfModes:
@@ -267,7 +267,7 @@ def _select_in_band(lines: Lines, options: SelectionOptions) -> tuple[Lines, Sel
     if lines.noise is not None:
         return _select_with_changing(lines, options)
     h, time_limit = lines.h, options.time_limit
-    few = replace(options, max_modes=min(FRF.strongest, options.max_modes))
+    few = replace(options, max_modes=min(FRF.noise_modes, options.max_modes))
     selected = select_modes(lines, few)
     guessed = relative_noise(lines, selected.fit)
     if guessed is None:  # noise proportional to the response would look like modes that change
@@ -316,7 +316,8 @@ def _select_weighted(lines: Lines, selected: SelectedModes, options: SelectionOp
         guessed = relative_noise(lines, selected.fit)
         if guessed is None:
             break
-        if before is not None and np.log(guessed / before).std(axis=(1, 2)).max() < FRF.alike:  # up to a factor
+        # the estimates agree up to a factor
+        if before is not None and np.log(guessed / before).std(axis=(1, 2)).max() < FRF.noise_tolerance:
             break
         if time_limit.spent("estimation of the noise"):
             return lines, selected
@@ -353,7 +354,7 @@ def _modes_of(
     stated = lines.weights is not None and not lines.guessed
     correlation = None if stated else correlation_of_lines([lines.left(fit).reshape(len(channels), -1)])
     covariance = pole_covariance(fit, noise_ratio * disturbed(correlation, fit.amplitudes / fit.noise[:, None]))
-    sure = np.sqrt(np.diag(covariance)[: fit.poles.size]) < FRF.most_error * np.abs(fit.poles)
+    sure = np.sqrt(np.diag(covariance)[: fit.poles.size]) < FRF.max_frequency_error * np.abs(fit.poles)
     sure &= fit.poles.real < SURE * np.sqrt(np.diag(covariance)[fit.poles.size :]) * np.abs(fit.poles)
     within = (fit.poles.imag >= lines.omega[0]) & (fit.poles.imag <= lines.omega[-1])
     within &= (damped_hz >= edges_hz[0]) & (damped_hz < edges_hz[1])
@@ -424,7 +425,7 @@ def _is_acausal(h: np.ndarray, f: np.ndarray) -> bool:
         return False
     power = (np.abs(np.fft.ifft(h * np.hanning(f.size), axis=-1)) ** 2).sum(axis=(0, 1))
     after, before = power[1 : f.size // 2].sum(), power[-(f.size // 2) + 1 :].sum()
-    return bool(before > FRF.acausal * after)
+    return bool(before > FRF.min_acausal_ratio * after)
 
 
 def _window_remark(rate: float) -> tuple[str, ...]:
@@ -440,7 +441,7 @@ def _window_remark(rate: float) -> tuple[str, ...]:
 def _noise_remark(misfit: Floats) -> tuple[str, ...]:
     """A remark where the residual, as the median of all outputs, is not as large as the stated noise."""
     ratio = float(np.median(misfit))
-    if 1.0 / FRF.disagrees < ratio < FRF.disagrees:
+    if 1.0 / FRF.min_noise_ratio < ratio < FRF.min_noise_ratio:
         return ()
     return (f"the residual is {ratio:.2g} times noise_std; standard errors are based on the residual",)
 
@@ -453,9 +454,9 @@ def _scatter_remark(estimate: FrfModes) -> tuple[str, ...]:
     if not which:
         return ()
     lines = 2.0 * estimate.modes.zeta * hz / np.diff(estimate.frequencies_hz).min()
-    narrow = [str(r + 1) for r in np.flatnonzero((estimate.scatter_hz > 0) & (lines < FRF.resolved))]
+    narrow = [str(r + 1) for r in np.flatnonzero((estimate.scatter_hz > 0) & (lines < FRF.bandwidth_lines))]
     leaks = (
-        f". Fewer than {FRF.resolved:g} lines lie in the half-power bandwidth of mode{'s' * (len(narrow) > 1)}"
+        f". Fewer than {FRF.bandwidth_lines:g} lines lie in the half-power bandwidth of mode{'s' * (len(narrow) > 1)}"
         f" {', '.join(narrow)}: if these are averages with a Hann window, its leakage makes that damping too high"
     )
     return (

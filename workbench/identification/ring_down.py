@@ -41,19 +41,20 @@ class RingDownSettings:
 
     max_modes: int = 20  # highest model order of the stabilisation diagram
     drift_rounds: int = 3  # alternations between modes and drift
-    parabola: int = 2  # degree of the drift removed before any mode is known
-    dominant: float = 0.5  # share of an output's variance that remains without a dominant drift, at most
-    undecayed: float = 0.5  # least ratio of the energies of the two halves of a record that does not decay
-    correlated: float = 0.5  # least correlation of an undecayed free decay after a third of the record
-    uncorrelated: float = 3.0  # correlation times √n_samples above which a signal oscillates; white noise has 1
-    residual_share: float = 0.1  # largest share of the energy in the bands of the modes that is residual
-    most_residual: float = 0.25  # likewise over all frequencies, where the residual is coloured
+    first_drift_degree: int = 2  # of the drift removed before any mode is known
+    max_remaining_share: float = 0.5  # of an output's variance, without a dominant drift
+    min_energy_ratio: float = 0.5  # of the two halves of a record that does not decay
+    min_correlation_ratio: float = 0.5  # of an undecayed free decay, at lags of a third of the record to short ones
+    # correlation times √n_samples above which a signal oscillates; white noise has 1
+    min_scaled_correlation: float = 3.0
+    max_band_residual: float = 0.1  # share of the energy in the bands of the modes
+    max_coloured_residual: float = 0.25  # likewise over all frequencies, where the residual is coloured
     cluster_band: float = 0.05  # relative distance from the frequency of a mode to undamped estimates beside it
-    cluster_size: int = 2  # number of these from which on ambient forces are suspected
-    second_shape: float = 0.1  # rms share of a mode's motion in all records outside one common shape, to be remarked
-    peak_ratio: float = 5.0  # largest ratio of the residual in the bands of the modes to that beside them
-    band: int = 6  # least half width of the band of a mode, bins
-    side_band: int = 60  # bins on either side of it
+    min_cluster_size: int = 2  # number of these from which on ambient forces are suspected
+    min_second_shape: float = 0.1  # rms share of a mode's motion in all records outside one common shape
+    max_peak_ratio: float = 5.0  # of the residual in the bands of the modes to that beside them
+    min_half_width: int = 6  # of the band of a mode, bins
+    side_band_bins: int = 60  # on either side of it
 
 
 RING_DOWN = RingDownSettings()
@@ -239,9 +240,9 @@ def _identify_with_drift(
 def _dominant_drifts(records: list[Record]) -> list[Drift]:
     """The drift of each record where it is larger than the motion, to which modes would be fitted; else none."""
     # no mode is a parabola
-    drifts = [without_drift(record, np.zeros(0, complex), most=RING_DOWN.parabola) for record in records]
+    drifts = [without_drift(record, np.zeros(0, complex), most=RING_DOWN.first_drift_degree) for record in records]
     variances = [(d.record.outputs.var(axis=1), r.outputs.var(axis=1)) for d, r in zip(drifts, records, strict=True)]
-    dominant = any((remaining < RING_DOWN.dominant * total).any() for remaining, total in variances)
+    dominant = any((remaining < RING_DOWN.max_remaining_share * total).any() for remaining, total in variances)
     return drifts if dominant and not any(_settles_within_a_period(drift) for drift in drifts) else []
 
 
@@ -294,9 +295,9 @@ def _check_undriven(record: Record) -> None:
     lags = correlation[: n // 20 + 1], correlation[n // 3 : n // 2]
     short, long = (float(np.sqrt((part**2).mean())) for part in lags)
     # White noise has no mode; the selection refuses it.
-    oscillates = short > RING_DOWN.uncorrelated / np.sqrt(n)
-    lasts = RING_DOWN.undecayed < energy[1] / max(energy[0], 1e-300) < 1.0 / RING_DOWN.undecayed
-    if oscillates and lasts and long < RING_DOWN.correlated * short:
+    oscillates = short > RING_DOWN.min_scaled_correlation / np.sqrt(n)
+    lasts = RING_DOWN.min_energy_ratio < energy[1] / max(energy[0], 1e-300) < 1.0 / RING_DOWN.min_energy_ratio
+    if oscillates and lasts and long < RING_DOWN.min_correlation_ratio * short:
         raise ValueError(
             f"record {record.name!r} is no free decay: it is as strong at its end as at its beginning, and not"
             f" correlated over its length. {WAY_OUT}"
@@ -343,14 +344,14 @@ def _large_residual(
         inside, beside = np.zeros((2, power.size), bool)
         for pole in refined.modes.poles:
             distance = np.abs(np.arange(1, power.size + 1) - pole.imag / bin_width)
-            half_width = max(RING_DOWN.band, abs(pole.real) / bin_width)
+            half_width = max(RING_DOWN.min_half_width, abs(pole.real) / bin_width)
             inside |= distance < half_width
-            beside |= (distance > 2.0 * half_width) & (distance < RING_DOWN.side_band + half_width)
+            beside |= (distance > 2.0 * half_width) & (distance < RING_DOWN.side_band_bins + half_width)
         beside &= ~inside
         share, total_share = (float(power[k].sum() / motion[k].sum()) for k in (inside, slice(None)))
         level = np.median(power[beside]) if beside.any() else 0.0
-        near_modes = share > RING_DOWN.residual_share and power[inside].mean() > RING_DOWN.peak_ratio * level
-        if near_modes or (total_share > RING_DOWN.most_residual and coloured):
+        near_modes = share > RING_DOWN.max_band_residual and power[inside].mean() > RING_DOWN.max_peak_ratio * level
+        if near_modes or (total_share > RING_DOWN.max_coloured_residual and coloured):
             return (
                 f"in record {record.name!r} the residual is {100 * np.sqrt(share):.0f} % of the motion in the bands of"
                 f" the modes, {100 * np.sqrt(total_share):.0f} % of all: it is driven, or depends strongly on"
@@ -386,7 +387,7 @@ def _inconsistent_shapes(refined: RefinedModes, records: list[Record], only: Seq
     for r in only:
         squares = np.linalg.svd(scaled[:, :, r], compute_uv=False) ** 2
         share = np.sqrt(squares[1:].sum() / squares.sum())
-        if share > RING_DOWN.second_shape and squares[1:].sum() > threshold:
+        if share > RING_DOWN.min_second_shape and squares[1:].sum() > threshold:
             inconsistent.append(mode_text(r, refined.modes.frequencies_hz[r], f", {100 * share:.0f} %"))
     if not inconsistent:
         return ()
@@ -417,7 +418,7 @@ def _ambient_excitation(refined: RefinedModes, mode_remarks: Sequence[str]) -> t
     undamped = refined.modes.zeta < SURE * refined.zeta_std
     for r in np.flatnonzero(sure):
         cluster = np.flatnonzero(undamped & ~sure & (np.abs(f - f[r]) < RING_DOWN.cluster_band * f[r]))
-        if cluster.size >= RING_DOWN.cluster_size:
+        if cluster.size >= RING_DOWN.min_cluster_size:
             which = ", ".join(str(k + 1) for k in cluster)
             return (
                 f"modes {which} cluster about mode {r + 1} and have no significant damping: forces drive this decay"
@@ -475,7 +476,7 @@ def remarks(refined: RefinedModes, records: Record | Sequence[Record]) -> tuple[
             lasts = zeta * modes.omega[r] * span < 1.0
             endless = "does not decay: mains hum?" if near_mains(f) else "does not decay within the record"
             texts.append(endless if lasts else WITHIN_ERROR)
-        elif zeta > SELECTION.most_damped:
+        elif zeta > SELECTION.max_damping:
             texts.append("hardly oscillates: a drift?")
         else:
             texts.append("")

@@ -207,7 +207,7 @@ def test_a_long_record_is_compared_at_fewer_samples_with_the_same_result(monkeyp
     noise = 0.01 * np.random.default_rng(0).standard_normal(time.size)
     record = Record(1e-4, (np.exp(np.outer(time, pair)).sum(axis=1).real + noise)[None], (Channel("v", "velocity"),))
     few = _Band(record, pair, np.zeros(0, complex))
-    monkeypatch.setattr(backbone, "BACKBONE", replace(backbone.BACKBONE, few=time.size))
+    monkeypatch.setattr(backbone, "BACKBONE", replace(backbone.BACKBONE, min_samples=time.size))
     each = _Band(record, pair, np.zeros(0, complex))
     assert few.time.size < each.time.size / 50
     z = np.exp(pair * 1e-4)

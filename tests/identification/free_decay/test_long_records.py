@@ -69,7 +69,7 @@ def test_records_together_tell_more(truth):
 
 def test_a_long_record_takes_this_road_by_itself(record, monkeypatch):
     part = replace(record, outputs=record.outputs[:, :4000])
-    monkeypatch.setattr(order, "ORDER", replace(order.ORDER, long=part.outputs.size - 1))
+    monkeypatch.setattr(order, "ORDER", replace(order.ORDER, long_record_values=part.outputs.size - 1))
     directly = one_blas_thread(identify_long)([part], max_modes=99)
     assert np.array_equal(identify(part).modes.omega, directly.modes.omega)
     assert identify(part, max_modes=2).modes.n_modes == 2

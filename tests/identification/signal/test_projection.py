@@ -82,7 +82,7 @@ def test_projection_holds_no_table_of_all_samples(truth):
 def test_projection_by_parts_is_the_same(truth, monkeypatch, offset):
     record = free_decay(truth, sample_time=0.5, n_samples=3000, noise_std=0.1)
     whole = project(record, truth.poles, offset)
-    monkeypatch.setattr(projection, "PROJECTION", replace(projection.PROJECTION, largest_factored=1, part=700))
+    monkeypatch.setattr(projection, "PROJECTION", replace(projection.PROJECTION, max_factored=1, part_samples=700))
     parts = project(record, truth.poles, offset)
     for name in ("residual", "squares", "coefficients", "gram", "slopes", "spread", "tilt"):
         exact = getattr(whole, name)
@@ -94,7 +94,7 @@ def test_refined_by_parts_is_the_same(truth, monkeypatch, noise):
     record = free_decay(truth, sample_time=0.5, n_samples=3000, noise_std=noise)
     start = SampledModes(truth.omega * (1 + 1e-4), truth.zeta + 1e-4, truth.shapes, truth.positions)
     whole = refine(record, start, offset=True)
-    monkeypatch.setattr(projection, "PROJECTION", replace(projection.PROJECTION, largest_factored=1))
+    monkeypatch.setattr(projection, "PROJECTION", replace(projection.PROJECTION, max_factored=1))
     parts = refine(record, start, offset=True)
     assert whole.converged and parts.converged
     allowed = 0.01 * whole.omega_std + 1e-12

@@ -128,7 +128,7 @@ def test_the_first_look_points_at_the_place():
     task = Task.of(measured("beam", lost=0.02, centre=0.4), NOMINAL["beam"], known_mass=[(0.5, 1.0)])
     problem = Problem.of(task, Basis.polynomial(2), Basis.polynomial(3))
     places, gains = scan(problem, fitted(problem))
-    assert abs(places[np.argmax(gains[LOSS.widths.index(0.1)])] - 0.4) < 0.05
+    assert abs(places[np.argmax(gains[LOSS.trial_widths.index(0.1)])] - 0.4) < 0.05
 
 
 @pytest.fixture(scope="module")

@@ -28,12 +28,12 @@ class AssumptionsSettings:
     """Constants of the test for dependence on amplitude."""
 
     segments: int = 4  # of a record, each twice as long as the one before
-    least_statistic: float = 100.0  # least χ² of a mode in a segment that is compared
-    least_cycles: float = 3.0  # least number of its cycles there
-    most_error: float = 0.01  # largest relative standard error of its frequency there
-    rounded: float = 3.0  # least rms of an output in a segment, in quantisation steps
+    min_statistic: float = 100.0  # χ² of a mode in a segment that is compared
+    min_cycles: float = 3.0  # of the mode there
+    max_frequency_error: float = 0.01  # relative standard error of its frequency there
+    min_rms_steps: float = 3.0  # rms of an output in a segment, in quantisation steps
     # relative changes of frequency and of damping ratio that are too small for the digits printed
-    resolution: tuple[float, float] = (1e-5, 1e-3)
+    printed_resolution: tuple[float, float] = (1e-5, 1e-3)
     false_alarm: float = 1e-3  # probability that a linear structure seems to depend on amplitude
 
 
@@ -113,7 +113,7 @@ def amplitude_dependence(
     values = [_segments(record, refined, np.abs(a), noise, segments, time_limit) for record, a, noise in each]
     start = np.concatenate([each[0] for each in values])
     amplitude, omega, omega_std, zeta, zeta_std = (frozen(rows) for rows in np.hstack([each[1] for each in values]))
-    both = zip((omega, zeta), (omega_std, zeta_std), ASSUMPTIONS.resolution, strict=True)
+    both = zip((omega, zeta), (omega_std, zeta_std), ASSUMPTIONS.printed_resolution, strict=True)
     probability = np.stack([_equality(value, np.hypot(std, resolution * value)) for value, std, resolution in both])
     which = np.repeat(np.arange(len(records)), segments)
     return AmplitudeDependence(
@@ -133,7 +133,7 @@ def _segments(
     values_by_segment = np.full((5, segments, modes.n_modes), np.nan)
     spacing = np.abs(np.subtract.outer(modes.omega, modes.omega))
     dropped = [(at, at + (count - 1) * record.sample_time) for _, at, count, _ in dropouts(record)]
-    least_rms = ASSUMPTIONS.rounded * steps(record)
+    least_rms = ASSUMPTIONS.min_rms_steps * steps(record)
     beats = np.where(np.eye(modes.n_modes, dtype=bool), np.inf, spacing).min(axis=1)
     for w, (first, last) in enumerate(zip(edges, edges[1:], strict=False)):
         span, decay = (last - first) * record.sample_time, -modes.poles.real
@@ -141,7 +141,7 @@ def _segments(
         # mean over the segment of the squared envelope
         mean_square = initial**2 * exprel(-2.0 * decay * span)
         statistic = (0.5 * (last - first) * mean_square / noise[:, None] ** 2).sum(axis=0)
-        significant = np.flatnonzero(statistic > ASSUMPTIONS.least_statistic)
+        significant = np.flatnonzero(statistic > ASSUMPTIONS.min_statistic)
         begins, ends = record.start_time + record.sample_time * np.array([first, last - 1])
         if significant.size == 0 or last - first < 4 * (significant.size + 1):
             continue
@@ -164,8 +164,8 @@ def _segments(
         distance = np.abs(np.subtract.outer(refitted.modes.poles, modes.poles[significant]))
         nearest = distance.argmin(axis=1)
         sure = distance.argmin(axis=0)[nearest] == np.arange(nearest.size)
-        sure &= refitted.omega_std < ASSUMPTIONS.most_error * refitted.modes.omega
-        sure &= refitted.modes.frequencies_hz * span > ASSUMPTIONS.least_cycles
+        sure &= refitted.omega_std < ASSUMPTIONS.max_frequency_error * refitted.modes.omega
+        sure &= refitted.modes.frequencies_hz * span > ASSUMPTIONS.min_cycles
         significant = significant[nearest]
         # Two modes whose beat is longer than the segment look like one that changes.
         sure &= beats[significant] * span > 2.0 * np.pi

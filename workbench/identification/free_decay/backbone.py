@@ -34,22 +34,23 @@ from workbench.records.record import Record
 class BackboneSettings:
     """Constants of the comparison."""
 
-    steps: int = 150  # of the integration of the envelope
-    faded: float = 7.0  # nepers of decay from which on frequency and damping are constant
-    died: float = 60.0  # nepers to which the envelope is limited
-    first_tries: int = 20  # evaluations of the fit from each start
-    most_tries: int = 40  # evaluations from the best of these
-    settled: float = 1e-4  # relative decrease of the sum of squares at which a fit ends
-    lasts: float = 14.0  # nepers of the slower mode at which a record is cut: e^-14 is 1e-6
-    samples_each: int = 20  # least number of samples per mode that remain
-    slightly: float = 1e-5  # step of finite differences, relative to the decay rate
-    largest: float = 1e100  # limit above which a motion diverges
-    lines: float = 10.0  # half width of the band of comparison beyond the two modes, in lines
-    bandwidths: float = 4.0  # and in addition to that, in half bandwidths
-    smooth: int = 4  # coefficients of the polynomial for modes outside the band
-    few: int = 1000  # least number of samples of a decimated motion
-    turns: float = 0.25  # rad per step from the centre to the edge of the band, at most: an error of 1e-8 of a sample
-    narrow: float = 0.1  # half width over frequency up to which the mirror image of the motion is such a polynomial too
+    envelope_steps: int = 150  # of the integration of the envelope
+    linear_nepers: float = 7.0  # of decay, from which on frequency and damping are constant
+    max_nepers: float = 60.0  # to which the envelope is limited
+    first_steps: int = 20  # evaluations of the fit from each start
+    max_steps: int = 40  # evaluations from the best of these
+    min_decrease: float = 1e-4  # relative, of the sum of squares at which a fit ends
+    record_nepers: float = 14.0  # of the slower mode, at which a record is cut: e^-14 is 1e-6
+    samples_per_mode: int = 20  # that remain, at least
+    difference_step: float = 1e-5  # of finite differences, relative to the decay rate
+    max_slope: float = 1e100  # of a motion by an unknown, above which it diverges
+    margin_lines: float = 10.0  # half width of the band of comparison beyond the two modes
+    margin_bandwidths: float = 4.0  # and in addition to that, in half bandwidths
+    background_coefficients: int = 4  # of the polynomial for modes outside the band
+    min_samples: int = 1000  # of a decimated motion
+    max_phase_step: float = 0.25  # rad from the centre to the edge of the band: an error of 1e-8 of a sample
+    # half width over frequency up to which the mirror image of the motion is such a polynomial too
+    narrow_band_ratio: float = 0.1
 
 
 BACKBONE = BackboneSettings()
@@ -94,7 +95,7 @@ def are_two(records: Sequence[Record], poles: Complexes, r: int, s: int, thresho
 def band_about(pair: Complexes, bin_width: float) -> tuple[float, float]:
     """Centre and half width, rad/s, of the band in which two modes of poles `pair` are compared."""
     low, high = float(pair.imag.min()), float(pair.imag.max())
-    wide = BACKBONE.bandwidths * float(np.abs(pair.real).sum()) + BACKBONE.lines * bin_width
+    wide = BACKBONE.margin_bandwidths * float(np.abs(pair.real).sum()) + BACKBONE.margin_lines * bin_width
     return 0.5 * (low + high), 0.5 * (high - low) + wide
 
 
@@ -112,13 +113,13 @@ class _Band:
     def __init__(self, record: Record, pair: Complexes, others: Complexes) -> None:
         dt = record.sample_time
         # The record is cut to where the two modes have decayed.
-        last = BACKBONE.lasts / max(float(-pair.real.max()) * dt, 1e-300)
-        last = int(max(last, BACKBONE.samples_each * (pair.size + others.size)))
+        last = BACKBONE.record_nepers / max(float(-pair.real.max()) * dt, 1e-300)
+        last = int(max(last, BACKBONE.samples_per_mode * (pair.size + others.size)))
         if last < record.n_samples - 1:
             record = record.between(record.start_time, record.start_time + last * dt)
         half = band_about(pair, 2.0 * np.pi / (record.n_samples * dt))[1]
-        self.step = max(int(min(record.n_samples / BACKBONE.few, BACKBONE.turns / (half * dt))), 1)
-        if half > BACKBONE.narrow * float(pair.imag.min()):
+        self.step = max(int(min(record.n_samples / BACKBONE.min_samples, BACKBONE.max_phase_step / (half * dt))), 1)
+        if half > BACKBONE.narrow_band_ratio * float(pair.imag.min()):
             self.step = 1
         n = record.n_samples // self.step * self.step
         y, time = record.outputs[0, :n], dt * np.arange(n, dtype=float)
@@ -131,7 +132,7 @@ class _Band:
         within = np.abs(others.imag - middle) < half + np.abs(others.real)
         elsewhere = (amplitudes[2:][~within] @ np.exp(np.outer(others[~within], time))).real
         others_basis = np.hstack(self.lines_of(np.exp(np.outer(others[within], self.time))))
-        smooth = np.linspace(-1.0, 1.0, self.lines.size)[:, None] ** np.arange(BACKBONE.smooth)
+        smooth = np.linspace(-1.0, 1.0, self.lines.size)[:, None] ** np.arange(BACKBONE.background_coefficients)
         others_basis = np.hstack([others_basis, np.kron(np.eye(2), smooth)])
         self.others_basis = np.linalg.qr(others_basis / np.maximum(np.linalg.norm(others_basis, axis=0), 1e-300))[0]
         lines = rfft(y - elsewhere)[self.lines] / np.sqrt(0.5 * n)
@@ -160,7 +161,7 @@ class _Band:
         From motions (n_motions, n_times) of free amplitudes A, and the derivatives (n_unknowns, n_times) of the motions
         `which` (n_unknowns,) by each unknown.
         """
-        if not (np.abs(slopes) < BACKBONE.largest).all():
+        if not (np.abs(slopes) < BACKBONE.max_slope).all():
             return diverged(self.y, len(slopes))
         real, imaginary = self.lines_of(np.vstack([motions, slopes]))
         p = len(motions)
@@ -198,7 +199,7 @@ def _modes_misfit(bands: Sequence[_Band], poles: Complexes) -> Floats:
     start = np.r_[poles.real, poles.imag]
     if len(bands) > 1:
         weights = np.sqrt([band.size for band in bands] / (squares(start) + [band.round_off for band in bands]))
-    return squares(CachedResidual(weighted).least(start, BACKBONE.most_tries, ftol=BACKBONE.settled))
+    return squares(CachedResidual(weighted).least(start, BACKBONE.max_steps, ftol=BACKBONE.min_decrease))
 
 
 def backbone_misfit(band: _Band, pair: Complexes, *, enough: float = 0.0) -> float:
@@ -210,12 +211,12 @@ def backbone_misfit(band: _Band, pair: Complexes, *, enough: float = 0.0) -> flo
     for powers in POWERS:
         model = _Backbone(band, np.array(powers))
         for start in model.starts(pair):
-            at = model.once.least(start, BACKBONE.first_tries, ftol=BACKBONE.settled)
+            at = model.once.least(start, BACKBONE.first_steps, ftol=BACKBONE.min_decrease)
             tried.append((float((model.once(at)[0] ** 2).sum()), model, at))
             if tried[-1][0] <= enough:
                 return tried[-1][0]
     _, model, at = min(tried, key=lambda each: each[0])
-    at = model.once.least(at, BACKBONE.most_tries, ftol=BACKBONE.settled)
+    at = model.once.least(at, BACKBONE.max_steps, ftol=BACKBONE.min_decrease)
     return float((model.once(at)[0] ** 2).sum())
 
 
@@ -225,9 +226,9 @@ def common_backbone_misfit(bands: Sequence[_Band], weights: Floats, pair: Comple
     In place of two linear modes of poles `pair`, rad/s; weights (n_records,) are 1 / noise.
     """
     models = [_Common([_Backbone(band, np.array(powers)) for band in bands], weights) for powers in POWERS]
-    first = [model.once.least(model.start(pair), BACKBONE.first_tries, ftol=BACKBONE.settled) for model in models]
+    first = [model.once.least(model.start(pair), BACKBONE.first_steps, ftol=BACKBONE.min_decrease) for model in models]
     best = int(np.argmin([(model.once(at)[0] ** 2).sum() for model, at in zip(models, first, strict=True)]))
-    return models[best].squares(models[best].once.least(first[best], BACKBONE.most_tries, ftol=BACKBONE.settled))
+    return models[best].squares(models[best].once.least(first[best], BACKBONE.max_steps, ftol=BACKBONE.min_decrease))
 
 
 @njit(cache=True, nogil=True)
@@ -282,9 +283,9 @@ def _integrals(u: Floats, rates: Floats, powers: Floats, time: Floats, h: float,
 
 def backbone_integrals(real: np.ndarray, powers: np.ndarray, time: np.ndarray) -> list[Floats]:
     """∫ r^p_k dt from 0 to each time, (n, n_powers), for each row of Re λ (n_rows, n_powers)."""
-    t = np.linspace(0.0, time[-1], BACKBONE.steps + 1)
-    u, rates = _envelopes(real, powers, t, BACKBONE.faded, BACKBONE.died)
-    return list(_integrals(u.T.copy(), rates.T.copy(), powers, time, t[1], BACKBONE.faded))
+    t = np.linspace(0.0, time[-1], BACKBONE.envelope_steps + 1)
+    u, rates = _envelopes(real, powers, t, BACKBONE.linear_nepers, BACKBONE.max_nepers)
+    return list(_integrals(u.T.copy(), rates.T.copy(), powers, time, t[1], BACKBONE.linear_nepers))
 
 
 class _Backbone:
@@ -309,13 +310,13 @@ class _Backbone:
         each = self.band.amplitudes * np.exp(np.outer(self.time, pair))
         z, slope = each.sum(axis=1), (each * pair).sum(axis=1)
         initial = max(abs(z[0]), 1e-3 * np.abs(z).max())
-        by_power = np.maximum(np.abs(z) / initial, np.exp(-BACKBONE.faded))[:, None] ** self.powers
+        by_power = np.maximum(np.abs(z) / initial, np.exp(-BACKBONE.linear_nepers))[:, None] ** self.powers
         return z[:, None] * by_power, slope, float(initial)
 
     def fitted(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Residual (2 n_lines,) and its Jacobian by Re λ and Im λ, (2 n_lines, 6)."""
         real, turn = unknowns[:3], 1j * unknowns[3:]
-        step = BACKBONE.slightly * max(abs(real[0]), 1e-3 / self.time[-1])
+        step = BACKBONE.difference_step * max(abs(real[0]), 1e-3 / self.time[-1])
         held, *moved = backbone_integrals(np.vstack([real, real + step * np.eye(3)]), self.powers, self.time)
         with np.errstate(over="ignore", invalid="ignore"):
             motion = np.exp(held @ (real + turn))
@@ -357,7 +358,7 @@ class _Common:
     def _parts(self, unknowns: Floats) -> Iterator[tuple[Floats, Floats, Floats, Floats]]:
         """For each record: residual, its Jacobian, its own six unknowns, and their ratios to the common ones."""
         level = np.zeros(len(self.each))
-        level[self.free] = np.clip(unknowns[6:], -BACKBONE.died, BACKBONE.died)
+        level[self.free] = np.clip(unknowns[6:], -BACKBONE.max_nepers, BACKBONE.max_nepers)
         for one, a in zip(self.each, level, strict=True):
             by = np.tile(np.exp(a * self.powers), 2)
             yield *one.once(by * unknowns[:6]), by * unknowns[:6], by

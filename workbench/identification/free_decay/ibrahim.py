@@ -36,10 +36,10 @@ LARGEST_MATRIX = 4_000_000  # entries
 class StabilitySettings:
     """Constants of the choice of modes that are stable over the orders of a diagram."""
 
-    frequency: float = 0.02  # largest relative difference of frequency between the poles of one mode
-    shape: float = 0.8  # least MAC between them
-    presence: float = 0.5  # least share of the orders
-    most_damped: float = 0.2  # damping ratio above which a pole is noise, as below zero
+    frequency_tolerance: float = 0.02  # largest relative difference between the poles of one mode
+    min_mac: float = 0.8  # between them
+    min_presence: float = 0.5  # share of the orders
+    max_damping: float = 0.2  # ratio above which a pole is noise, as below zero
 
 
 STABILITY = StabilitySettings()
@@ -198,7 +198,7 @@ def stable_modes(diagram: Stabilisation, *, min_phase_collinearity: float = 0.8)
     """
     groups: list[list[tuple[SampledModes, int]]] = []
     for modes in diagram.found:
-        is_mode = (modes.zeta > 0) & (modes.zeta < STABILITY.most_damped)
+        is_mode = (modes.zeta > 0) & (modes.zeta < STABILITY.max_damping)
         keep = is_mode & (modes.phase_collinearity >= min_phase_collinearity)
         taken = set()
         # The most collinear shapes are assigned first: a mode precedes poles that split off it.
@@ -210,7 +210,7 @@ def stable_modes(diagram: Stabilisation, *, min_phase_collinearity: float = 0.8)
             if near not in taken:
                 groups[near].append((modes, r))
                 taken.add(near)
-    stayed = [group for group in groups if len(group) >= STABILITY.presence * len(diagram.orders)]
+    stayed = [group for group in groups if len(group) >= STABILITY.min_presence * len(diagram.orders)]
     best = [max(group, key=lambda item: item[0].phase_collinearity[item[1]]) for group in stayed]
     n_outputs, positions = len(diagram.found[0].positions), diagram.found[0].positions
     omega, zeta = np.array([(modes.omega[r], modes.zeta[r]) for modes, r in best]).reshape(-1, 2).T
@@ -222,10 +222,10 @@ def stable_modes(diagram: Stabilisation, *, min_phase_collinearity: float = 0.8)
 
 def _nearest(groups: list[list[tuple[SampledModes, int]]], modes: SampledModes, r: int) -> int | None:
     """Index of the group whose last member agrees best with mode r in frequency and shape; None if none agrees."""
-    nearest, distance = None, STABILITY.frequency
+    nearest, distance = None, STABILITY.frequency_tolerance
     for i, group in enumerate(groups):
         last, k = group[-1]
         difference = abs(modes.omega[r] / last.omega[k] - 1.0)
-        if difference <= distance and mac(modes.shapes[:, [r]], last.shapes[:, [k]])[0, 0] >= STABILITY.shape:
+        if difference <= distance and mac(modes.shapes[:, [r]], last.shapes[:, [k]])[0, 0] >= STABILITY.min_mac:
             nearest, distance = i, difference
     return nearest

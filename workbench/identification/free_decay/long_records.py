@@ -43,23 +43,23 @@ from workbench.threads import cores
 class LongSettings:
     """Constants of the search in long records."""
 
-    slowest: float = 0.7  # lowest decay rate of the search, nepers over the record
-    ratio: float = 4.0  # of each decay rate to the one before
-    life: float = 8.0  # time constants after which an exponential is cut off
-    at_once: int = 16  # outputs transformed together
-    half_window: int = 64  # least number of cells on either side of a peak, from which the noise about it is estimated
-    # quantiles that estimate it: the residual about a mode that depends on amplitude is not smooth
-    quantiles: tuple[float, ...] = (0.5, 0.9)
-    leaked: float = 2.0  # least ratio of a peak to the leakage of stronger peaks
-    least_independent: float = 0.05  # least share of a candidate outside the span of the current modes
-    overlaps: float = 0.5  # least share of common energy of two modes that overlap
+    min_decay_nepers: float = 0.7  # lowest decay rate of the search, over the record
+    rate_ratio: float = 4.0  # of each decay rate to the one before
+    max_time_constants: float = 8.0  # after which an exponential is cut off
+    batch_size: int = 16  # outputs transformed together
+    min_half_window: int = 64  # cells on either side of a peak, from which the noise about it is estimated
+    # that estimate it: the residual about a mode that depends on amplitude is not smooth
+    noise_quantiles: tuple[float, ...] = (0.5, 0.9)
+    min_leakage_ratio: float = 2.0  # of a peak to the leakage of stronger peaks
+    min_independent_share: float = 0.05  # of a candidate, outside the span of the current modes
+    overlap_share: float = 0.5  # least share of common energy of two modes that overlap
     ridge: float = 1e-10  # regularisation for overlapping modes, relative to the energy of each
-    steps: int = 6  # of least squares after peaks entered
-    most_rounds: int = 60
-    most_rejections: int = 2  # of a peak that is tried again: the first may be due to poles that have not converged
+    entry_steps: int = 6  # of least squares after peaks entered
+    max_rounds: int = 60
+    max_rejections: int = 2  # of a peak that is tried again: the first may be due to poles that have not converged
     # rounds without a further mode after which the search ends: in coloured noise, or where modes depend on amplitude,
     # it might not end otherwise
-    most_fruitless: int = 3
+    max_fruitless_rounds: int = 3
 
 
 LONG = LongSettings()
@@ -77,10 +77,10 @@ def identify_long(
     # Correlated noise makes peaks in all outputs; combinations of uncorrelated noise do without them.
     mixed = _Search(uncorrelated[0], false_alarm, measured.time_limit)
     mixed.origins = measured.origins
-    mixed.settle(measured.poles, LONG.steps)
+    mixed.settle(measured.poles, LONG.entry_steps)
     mixed.run(max_modes)
     measured.rejected += mixed.rejected
-    measured.settle(mixed.poles, FIT.most_steps)
+    measured.settle(mixed.poles, FIT.max_steps)
     return measured.refined(mixed.statistic()) if mixed.poles.size else None
 
 
@@ -99,10 +99,10 @@ class _Search:
         self.dt, self.longest = records[0].sample_time, max(r.n_samples for r in records)
         self.span = self.longest * self.dt
         self.bin_width = 2.0 * np.pi / self.span
-        count = 1 + int(np.log(max(0.1 * np.pi * self.longest / LONG.slowest, 1.0)) / np.log(LONG.ratio))
-        self.rates = LONG.slowest / self.span * LONG.ratio ** np.arange(count)
+        count = 1 + int(np.log(max(0.1 * np.pi * self.longest / LONG.min_decay_nepers, 1.0)) / np.log(LONG.rate_ratio))
+        self.rates = LONG.min_decay_nepers / self.span * LONG.rate_ratio ** np.arange(count)
         n_signals = sum(r.n_outputs for r in records)
-        self.white = chi2.ppf(LONG.quantiles, 2 * n_signals)
+        self.white = chi2.ppf(LONG.noise_quantiles, 2 * n_signals)
         n_cells = sum(self._size(rate)[1] // 2 for rate in self.rates)
         self.enter, self.limit = thresholds(false_alarm, n_cells, n_signals)
         # The round-off level of sums over so many samples.
@@ -116,18 +116,18 @@ class _Search:
     def run(self, max_modes: int) -> None:
         """Add peaks and remove modes that fail the tests, until no peak exceeds the noise."""
         fruitless = 0
-        for _ in range(LONG.most_rounds):
+        for _ in range(LONG.max_rounds):
             before = self.poles.size
             # The first modes are searched whatever the time.
-            ended = fruitless >= LONG.most_fruitless or (before > 0 and self.time_limit.spent(FURTHER))
+            ended = fruitless >= LONG.max_fruitless_rounds or (before > 0 and self.time_limit.spent(FURTHER))
             peaks = np.zeros(0) if ended else self.peaks()[: max(max_modes - before, 0)]
             if peaks.size:
                 self.origins = np.append(self.origins, peaks)
-                self.settle(np.append(self.poles, peaks), LONG.steps)
+                self.settle(np.append(self.poles, peaks), LONG.entry_steps)
                 self.remove()
                 fruitless = 0 if self.poles.size > before else fruitless + 1
             else:
-                self.settle(self.poles, FIT.most_steps)
+                self.settle(self.poles, FIT.max_steps)
                 if not self.remove(thoroughly=not self.time_limit.spent("check of each mode")):
                     break
 
@@ -152,7 +152,7 @@ class _Search:
         taken, heights = np.zeros(0, complex), np.zeros(0)
         for r in np.argsort(-height):
             leaked = np.sqrt(heights * self._overlap(taken, poles[r])).sum() ** 2
-            if height[r] > LONG.leaked * leaked and height[r] > self.enter * self._noise_ratio(poles[r]):
+            if height[r] > LONG.min_leakage_ratio * leaked and height[r] > self.enter * self._noise_ratio(poles[r]):
                 taken, heights = np.append(taken, poles[r]), np.append(heights, height[r])
         return taken
 
@@ -168,7 +168,7 @@ class _Search:
         out = spurious_modes(self.poles, shapes, statistic, self.bin_width) | (statistic < limit)
         if thoroughly:
             for r in map(int, np.flatnonzero(~out)):
-                near = np.flatnonzero(self._overlap(self.poles, self.poles[r]) > LONG.overlaps)
+                near = np.flatnonzero(self._overlap(self.poles, self.poles[r]) > LONG.overlap_share)
                 if near.size == 1:
                     continue
                 # χ² in combinations of the outputs that are orthogonal to the shapes of the neighbours
@@ -178,7 +178,7 @@ class _Search:
                     out[r] = statistic[r] < limit[r]
         for r in map(int, np.flatnonzero(out)):
             # Of two overlapping modes the weaker leaves first: the other may then be significant.
-            weaker = out & (statistic < statistic[r]) & (self._overlap(self.poles, self.poles[r]) > LONG.overlaps)
+            weaker = out & (statistic < statistic[r]) & (self._overlap(self.poles, self.poles[r]) > LONG.overlap_share)
             out[r] = not weaker.any()
         if out.any():
             self.rejected += [(complex(pole), e) for pole, e in zip(self.origins[out], statistic[out], strict=True)]
@@ -205,8 +205,8 @@ class _Search:
 
     def _size(self, rate: float) -> tuple[int, int]:
         """Samples that an exponential of this decay rate lasts, and the length of a transform that resolves it."""
-        n = min(self.longest, int(np.ceil(LONG.life / (rate * self.dt))))
-        return n, next_fast_len(n if rate * n * self.dt > 0.5 * LONG.life else 2 * n, real=True)
+        n = min(self.longest, int(np.ceil(LONG.max_time_constants / (rate * self.dt))))
+        return n, next_fast_len(n if rate * n * self.dt > 0.5 * LONG.max_time_constants else 2 * n, real=True)
 
     def _strengths(self, rate: float) -> np.ndarray:
         """χ² of one decay rate at every frequency of its transform, (n_frequencies,), without 1 / (1 - o)."""
@@ -216,8 +216,8 @@ class _Search:
             n = min(lives, len(fit.residual))
             energy = np.expm1(-2.0 * rate * self.dt * n) / np.expm1(-2.0 * rate * self.dt)
             scale = (np.sqrt(2.0 / energy) * weights).astype(np.float32)
-            for first in range(0, weights.size, LONG.at_once):
-                some = slice(first, first + LONG.at_once)
+            for first in range(0, weights.size, LONG.batch_size):
+                some = slice(first, first + LONG.batch_size)
                 # In single precision and in place, to save memory.
                 decayed = np.zeros((scale[some].size, size), np.float32)
                 decay = np.arange(n, dtype=np.float32)
@@ -237,34 +237,34 @@ class _Search:
     def _noise_ratio(self, pole: complex) -> float:
         """Noise about a pole over white noise, 1 or more, by quantiles of the last χ² of the lowest decay rate."""
         step = np.pi / (self.fine.size * self.dt)
-        at, half = round(pole.imag / step), max(int(abs(pole.real) / step), LONG.half_window)
+        at, half = round(pole.imag / step), max(int(abs(pole.real) / step), LONG.min_half_window)
         nearby = self.fine[max(at - half, 0) : at + half + 1]
-        return max(1.0, float((np.quantile(nearby, LONG.quantiles) / self.white).max()))
+        return max(1.0, float((np.quantile(nearby, LONG.noise_quantiles) / self.white).max()))
 
     def _peaks(self, rate: float, strengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """χ² and poles of the local maxima of one decay rate that exceed white noise."""
         step = 2.0 * np.pi / (self._size(rate)[1] * self.dt)
         omega = step * np.arange(strengths.size)
-        lowest = max(rate / SELECTION.most_damped, 1.5 * self.bin_width)
+        lowest = max(rate / SELECTION.max_damping, 1.5 * self.bin_width)
         inside = (omega > lowest) & (omega < np.pi / self.dt - self.bin_width)
         highest = np.r_[False, (strengths[1:-1] > strengths[:-2]) & (strengths[1:-1] >= strengths[2:]), False]
-        at = np.flatnonzero(inside & highest & (strengths > LONG.least_independent * self.enter))
+        at = np.flatnonzero(inside & highest & (strengths > LONG.min_independent_share * self.enter))
         poles = -rate + 1j * omega[at]
         rejected = np.zeros(at.size, int)
         for pole, _ in self.rejected:
             rejected += np.abs(poles.imag - pole.imag) < 2.0 * max(self.bin_width, 0.5 * abs(pole.real))
-        at, poles = at[rejected < LONG.most_rejections], poles[rejected < LONG.most_rejections]
+        at, poles = at[rejected < LONG.max_rejections], poles[rejected < LONG.max_rejections]
         independent_share = self._independent(poles)
-        chi_square = strengths[at] / np.maximum(independent_share, LONG.least_independent)
-        good = (independent_share > LONG.least_independent) & (chi_square > self.enter)
+        chi_square = strengths[at] / np.maximum(independent_share, LONG.min_independent_share)
+        good = (independent_share > LONG.min_independent_share) & (chi_square > self.enter)
         return chi_square[good], poles[good]
 
     def _independent(self, poles: np.ndarray) -> np.ndarray:
         """Share of each candidate, sorted by frequency, outside the span of the current modes, (n_candidates,)."""
         share = np.ones(poles.size)
         reach = 3.0 * (2.0 * self.bin_width + np.abs(self.poles.real))
-        for first in range(0, poles.size, LONG.half_window):
-            block = slice(first, first + LONG.half_window)
+        for first in range(0, poles.size, LONG.min_half_window):
+            block = slice(first, first + LONG.min_half_window)
             candidates = poles[block]
             wider = reach + 3.0 * np.abs(candidates[0].real)
             near = self.poles[
@@ -302,6 +302,6 @@ class _Search:
             own = (a @ np.exp(np.outer(self.poles[near], self.dt * np.arange(record.n_samples)))).real
             projected.append(replace(record, outputs=residual.T + own, output_channels=channels))
         alone = np.ones((len(projected), directions.shape[1]))
-        _, with_it, *_ = fitted_poles(projected, self.poles[near], alone, False, SELECTION.few_steps)
-        _, without, *_ = fitted_poles(projected, self.poles[near[near != r]], alone, False, SELECTION.few_steps)
+        _, with_it, *_ = fitted_poles(projected, self.poles[near], alone, False, SELECTION.trial_steps)
+        _, without, *_ = fitted_poles(projected, self.poles[near[near != r]], alone, False, SELECTION.trial_steps)
         return float(sum((a.residual**2).sum() - (b.residual**2).sum() for a, b in zip(without, with_it, strict=True)))

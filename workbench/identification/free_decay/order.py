@@ -66,25 +66,26 @@ from workbench.threads import one_blas_thread
 class OrderSettings:
     """Constants of the selection of modes of a free decay, in addition to those of `searches.SELECTION`."""
 
-    long: int = 100_000  # total number of values above which many modes enter at a time
+    long_record_values: int = 100_000  # above which in total many modes enter at a time
     max_modes: int = 40  # unless given: a joint fit of more takes minutes
-    whitenings: int = 2  # alternations between noise spectrum and modes
-    # Modes that whitening removed are true, and stay, if they reduce the residual to this share of its energy or less;
+    whitening_rounds: int = 2  # alternations between noise spectrum and modes
+    # Modes that whitening removed are true, and stay, if they reduce the energy of the residual to this share or less;
     # modes fitted to coloured noise reduce it by a part only.
-    whitened_away: float = 0.1
+    max_restored_ratio: float = 0.1
     # consecutive candidates below the threshold, and candidates that split a mode, after which the search ends
-    most_weak: int = 2
-    most_splits: int = 6
-    # Least ratio of a decay rate to the frequency step of its transform: the exponential has decayed to e^-25 at the
-    # end of the transform.
-    coarser: float = 4.0
-    least_independent: float = 1e-7  # least share of a candidate outside the span of the model, to be distinguishable
-    resolved: float = 1e-13  # share of the largest eigenvalue of a Gram matrix, below which a direction is round-off
+    max_weak: int = 2
+    max_splits: int = 6
+    # of a decay rate to the frequency step of its transform: the exponential has decayed to e^-25 at the end of the
+    # transform
+    min_rate_ratio: float = 4.0
+    min_independent_share: float = 1e-7  # of a candidate, outside the span of the model, to be distinguishable
+    min_eigenvalue_ratio: float = 1e-13  # to the largest of a Gram matrix, below which a direction is round-off
     # bandwidths by which a mode selected in whitened records may move when refined in the records as measured
-    lost: float = 5.0
-    most_residual: float = 0.5  # largest share of a record's energy in the residual of modes that explain it
-    acting: float = 0.01  # rms of an input that acts after the start of the decay, over its largest value, at least
-    same: float = 0.05  # bandwidths that two poles may move before the test for one nonlinear mode is repeated
+    max_shift: float = 5.0
+    max_residual_share: float = 0.5  # of a record's energy, in the residual of modes that explain it
+    min_input_ratio: float = 0.01  # rms of an input that acts after the start of the decay, over its largest value
+    # bandwidths that two poles may move before the test for one nonlinear mode is repeated
+    pole_tolerance: float = 0.05
 
 
 ORDER = OrderSettings()
@@ -137,7 +138,7 @@ def _driven(record: Record) -> tuple[str, ...]:
     if not record.inputs.any():
         return ()
     after = record.between(decay_start(record)).inputs.std(axis=1)
-    acts = after > ORDER.acting * np.abs(record.inputs).max(axis=1)
+    acts = after > ORDER.min_input_ratio * np.abs(record.inputs).max(axis=1)
     if not acts.any() or decays(record):
         return ()
     each = zip(record.input_channels, after, acts, strict=True)
@@ -169,7 +170,7 @@ def identify_within(
     most = (shortest.n_samples - 4) // 3
     if most < 1:
         raise ValueError(f"record {shortest.name!r} has {shortest.n_samples} samples; a mode needs 7: measure longer")
-    is_long = sum(r.outputs.size for r in records) > ORDER.long
+    is_long = sum(r.outputs.size for r in records) > ORDER.long_record_values
     most = min(max_modes or (10 if is_long else 1) * ORDER.max_modes, most)
     select = identify_long if is_long else _identify_stepwise
     found = select(records, max_modes=most, false_alarm=false_alarm, time_limit=time_limit)
@@ -191,7 +192,7 @@ def _identify_stepwise(
     def selected(some: Sequence[Record]) -> tuple[_FreeDecay, _Model]:
         problem = _FreeDecay(some, false_alarm, records, search_time, verdicts)
         selection = OrderSelection(
-            problem, max_modes, ORDER.most_weak, ORDER.most_splits, forgets=False, time_limit=search_time, alone=True
+            problem, max_modes, ORDER.max_weak, ORDER.max_splits, forgets=False, time_limit=search_time, alone=True
         )
         model = selection.select(problem.nothing)
         problem.rejected = selection.rejected
@@ -199,7 +200,7 @@ def _identify_stepwise(
 
     problem, model = selected(records)
     explained = problem.explains(model)
-    for _ in range(ORDER.whitenings):
+    for _ in range(ORDER.whitening_rounds):
         # After an unfinished search the residual still holds modes.
         if search_time.unfinished or search_time.spent("whitening of the noise"):
             break
@@ -213,7 +214,7 @@ def _identify_stepwise(
         all_modes = np.append(fewer.poles, model.poles[other.lost(model.poles, fewer.poles)])
         if explained:
             share, share_of_fewer = (_residual_share(records, poles) for poles in (all_modes, fewer.poles))
-            if share < ORDER.whitened_away * share_of_fewer:
+            if share < ORDER.max_restored_ratio * share_of_fewer:
                 fewer = other.fitted(all_modes, fewer.weights)
         problem, model = other, fewer
     problem.time_limit = time_limit
@@ -374,19 +375,20 @@ class _FreeDecay:
             return
         for r, (pole, strength) in enumerate(zip(model.poles, statistic, strict=True)):
             distance = np.abs(np.delete(model.poles, r) - pole).min(initial=np.inf)
-            if strength < SELECTION.weak * self.threshold(model, pole) or distance < SELECTION.close * abs(pole.real):
+            weak = strength < SELECTION.weak_ratio * self.threshold(model, pole)
+            if weak or distance < SELECTION.close_bandwidths * abs(pole.real):
                 yield complex(pole), self._without(model, r), False
 
     def explains(self, model: _Model) -> bool:
         """Whether the modes explain most of the energy of every record."""
         energy = [record.n_samples * record.outputs.var(axis=1).sum() for record in self.records]
-        return bool((_squares(model.residuals).sum(axis=1) < ORDER.most_residual * np.array(energy)).all())
+        return bool((_squares(model.residuals).sum(axis=1) < ORDER.max_residual_share * np.array(energy)).all())
 
     def oscillating(self, model: _Model) -> Complexes:
         """The poles that oscillate within a record and do not grow, rad/s; others may be coloured noise."""
         poles: Complexes = model.poles
         span = max(record.n_samples * record.sample_time for record in self.records)
-        return poles[(poles.real * span < SELECTION.most_growth) & (np.abs(poles) * span > 2.0 * np.pi)]
+        return poles[(poles.real * span < SELECTION.max_growth) & (np.abs(poles) * span > 2.0 * np.pi)]
 
     def refined(self, model: _Model) -> IdentifiedModes:
         """The modes refined in the records as measured: whitening filters lose the first samples, the strongest."""
@@ -412,14 +414,15 @@ class _FreeDecay:
     def lost(self, poles: np.ndarray, others: np.ndarray) -> np.ndarray:
         """Which poles have none of the others within a few of their bandwidths, (n_poles,)."""
         distance = np.abs(np.subtract.outer(poles, others)).min(axis=1, initial=np.inf)
-        return np.asarray(distance > ORDER.lost * (np.abs(poles.real) + self.grids[0].bin_width))
+        return np.asarray(distance > ORDER.max_shift * (np.abs(poles.real) + self.grids[0].bin_width))
 
     def fitted(self, poles: np.ndarray, weights: np.ndarray, *, decide: bool = False) -> _Model:
         """The model of refined poles, weighted by the noise of each sensor in each record.
 
         With `decide` only as precisely as a decision on a mode needs it.
         """
-        most_steps, enough = (SELECTION.few_steps, SELECTION.decided) if decide else (FIT.most_steps, FIT.negligible)
+        trial = SELECTION.trial_steps, SELECTION.trial_tolerance
+        most_steps, enough = trial if decide else (FIT.max_steps, FIT.cost_tolerance)
         if poles.size:
             poles, fits, *_ = fitted_poles(
                 self.records, poles, weights, True, most_steps, enough=enough, time_limit=self.time_limit
@@ -454,7 +457,8 @@ class _FreeDecay:
         middle, half = band_about(pair, width)
         group = np.r_[pair, np.sort_complex(others[np.abs(others.imag - middle) < half])]
         for known, verdict in self.verdicts:
-            if known.size == group.size and (np.abs(known - group) < ORDER.same * (np.abs(group.real) + width)).all():
+            tolerance = ORDER.pole_tolerance * (np.abs(group.real) + width)
+            if known.size == group.size and (np.abs(known - group) < tolerance).all():
                 return verdict
         verdict = False
         with suppress(np.linalg.LinAlgError):
@@ -485,9 +489,9 @@ class _Grid:
         self.rates = np.r_[0.0, np.geomspace(1.0 / span, max(fastest, 2.0 / span), n_rates)]
         inside = (omega > np.pi / span) & (omega < np.pi / dt - np.pi / span)
         columns, self.omega = np.flatnonzero(inside), omega[inside]
-        self.n_cells = sum(int((rate < SELECTION.most_damped * self.omega).sum()) for rate in self.rates)
+        self.n_cells = sum(int((rate < SELECTION.max_damping * self.omega).sum()) for rate in self.rates)
         step = 2.0 * np.pi / (self.size * dt)
-        self.strides = [1 << int(np.log2(max(rate / (ORDER.coarser * step), 1.0))) for rate in self.rates]
+        self.strides = [1 << int(np.log2(max(rate / (ORDER.min_rate_ratio * step), 1.0))) for rate in self.rates]
         # For each rate: the indices of its frequencies in `omega`, and in its own transform.
         self.cells = [np.flatnonzero(columns % stride == 0) for stride in self.strides]
         self.columns = [columns[at] // stride for at, stride in zip(self.cells, self.strides, strict=True)]
@@ -514,7 +518,7 @@ class _Grid:
         modes = _Span(np.exp(poles * self.record.sample_time), self.record.n_samples)
         for k, (decay, energy, w, double, ends) in enumerate(self._tables):
             rate, cells = self.rates[k], self.cells[k]
-            allowed = rate < SELECTION.most_damped * self.omega[cells]
+            allowed = rate < SELECTION.max_damping * self.omega[cells]
             decayed = weighted[: decay.size] * decay[:, None]
             spectrum = np.fft.rfft(decayed, self.size // self.strides[k], axis=0)[self.columns[k]]
             power = (np.abs(spectrum) ** 2).sum(axis=1)
@@ -526,7 +530,7 @@ class _Grid:
                 p[at] -= dp
                 q[at] -= dq
             det = p**2 - np.abs(q) ** 2
-            good = allowed & (det > ORDER.least_independent * energy**2) & (p > 0)
+            good = allowed & (det > ORDER.min_independent_share * energy**2) & (p > 0)
             top = 2.0 * p * power - 2.0 * (q * conjugate_power).real
             chi_square[k, cells] = np.where(good, top / np.where(good, det, 1.0), 0.0)
         return chi_square
@@ -550,7 +554,7 @@ class _Span:
         gram = np.block([[(turned + same).real, (same + turned).imag], [(same - turned).imag, (turned - same).real]])
         scale = 1.0 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
         values, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
-        kept = values > ORDER.resolved * values.max(initial=0.0)
+        kept = values > ORDER.min_eigenvalue_ratio * values.max(initial=0.0)
         self.to_basis = vectors[:, kept].T * scale / np.sqrt(2.0 * values[kept, None])
 
     def shared(self, w: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

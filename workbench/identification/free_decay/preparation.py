@@ -31,46 +31,46 @@ from workbench.structure.modes import frozen
 class StartSettings:
     """Constants of the test for a free decay, of the detection of its start, of spikes, and of exponential settling."""
 
-    order: int = 32  # of the backward predictor
-    block: int = 4  # samples per update of the predictor
-    memory: int = 4  # of the predictor's coefficients, in orders
+    predictor_order: int = 32  # of the backward predictor
+    update_samples: int = 4  # per update of the predictor
+    coefficient_memory: int = 4  # of the predictor, in orders
     level_memory: int = 2  # of the level of its errors, in orders
-    most_signals: int = 8  # combinations of outputs that the predictor is estimated from
-    most_samples: int = 40_000  # per rate; longer records are tested at lower rates only
-    most_sensors: int = 256  # that are combined, evenly spaced among all: more take minutes
-    coarser: int = 4  # ratio of one rate to the next
+    max_combinations: int = 8  # of outputs, that the predictor is estimated from
+    max_samples: int = 40_000  # per rate; longer records are tested at lower rates only
+    max_sensors: int = 256  # that are combined, evenly spaced among all: more take minutes
+    rate_ratio: int = 4  # of one rate to the next
     # Squared prediction error over its level that is a break: alone; where the energy of the motion also rises by the
-    # factor `rise`; or, `lesser`, within `near` samples of another break, for a force that dies away.
-    alone: float = 100.0
-    rising: float = 25.0
-    rise: float = 4.0
-    lesser: float = 16.0
-    near: int = 8
-    rates: int = 8  # of exponential settling in one round of the search
-    rounds: int = 4  # of that search, each about the best rate of the one before
-    fastest: float = 0.1  # highest rate of settling, per sample
-    least_energy: float = 0.01  # share of the record's energy after a break from which on the decay begins there
-    most_spikes: int = 10  # single samples that are replaced
-    neighbours: int = 8  # on either side, from which a spike is interpolated
-    about: int = 200  # samples on either side, from which the interpolation is estimated
-    leaps: float = 6.0  # interpolation error of a spike, in standard deviations
-    decayed: float = 0.1  # rms of the last tenth over the largest of any tenth, below which a record has decayed
-    falling: int = 6  # tenths of decreasing level: by chance in 1 of 720 stationary records
-    # Share of the energy that decaying modes leave of a short free decay, at most: 0.05 where noise is a tenth of the
-    # motion. Of 28 random vibrations of one to five decay times they leave 0.14 to 0.96, as accelerations; as
-    # displacements, one of one decay time may leave less.
-    left: float = 0.05
-    modes: int = 8  # of that fit
-    instants: int = 600  # of that fit: fewer than the samples alias frequencies, and leave decays as they are
-    signals: int = 8  # of that fit, evenly spaced among the outputs
+    # factor `energy_rise`; or within `repeated_samples` of another break, for a force that dies away.
+    break_ratio: float = 100.0
+    rising_ratio: float = 25.0
+    energy_rise: float = 4.0
+    repeated_ratio: float = 16.0
+    repeated_samples: int = 8
+    settling_rates: int = 8  # of exponential settling in one round of the search
+    settling_rounds: int = 4  # of that search, each about the best rate of the one before
+    max_settling_rate: float = 0.1  # per sample
+    min_energy_share: float = 0.01  # of the record, after a break from which on the decay begins there
+    max_spikes: int = 10  # single samples that are replaced
+    interpolation_samples: int = 8  # on either side of a spike
+    estimation_samples: int = 200  # on either side, from which the interpolation is estimated
+    min_spike_ratio: float = 6.0  # of its interpolation error to the standard deviation of others
+    decayed_ratio: float = 0.1  # rms of the last tenth over the largest of any tenth, below which a record has decayed
+    falling_tenths: int = 6  # of decreasing level: by chance in 1 of 720 stationary records
+    # of the energy, that decaying modes leave of a short free decay: 0.05 where noise is a tenth of the motion. Of 28
+    # random vibrations of one to five decay times they leave 0.14 to 0.96, as accelerations; as displacements, one of
+    # one decay time may leave less.
+    max_residual_share: float = 0.05
+    fit_modes: int = 8  # of that fit
+    fit_samples: int = 600  # of that fit: fewer than the samples alias frequencies, and leave decays as they are
+    fit_outputs: int = 8  # of that fit, evenly spaced among the outputs
 
 
 START = StartSettings()
 HIGHEST_DEGREE = 8  # of a drift; polynomials of higher degree oscillate like modes
 PART = 16_384  # most samples of a part of a record in the fit of drifts
 # Least number of samples to estimate the predictor and to test it.
-SHORTEST = (4 + START.level_memory) * START.order
-UPPER = np.triu(np.ones((START.order + 1, START.order + 1)))
+SHORTEST = (4 + START.level_memory) * START.predictor_order
+UPPER = np.triu(np.ones((START.predictor_order + 1, START.predictor_order + 1)))
 
 
 def decay_start(record: Record) -> float:
@@ -89,11 +89,11 @@ def decay_start(record: Record) -> float:
     if not signals.any():
         return float(record.start_time)
     energy_after = np.cumsum(np.einsum("jt,jt->t", signals, signals)[::-1])[::-1]
-    matters = energy_after >= START.least_energy * energy_after[0]
+    matters = energy_after >= START.min_energy_share * energy_after[0]
     starts = np.zeros(0, int)
     step = 1
-    while n > START.most_samples * step:
-        step *= START.coarser
+    while n > START.max_samples * step:
+        step *= START.rate_ratio
     while n // step >= SHORTEST:
         window = blackman(6 * step, sym=False) if step > 1 else np.ones(1)
         window /= window.sum()
@@ -109,7 +109,7 @@ def decay_start(record: Record) -> float:
         # A break found at a higher rate shows in every window that contains it.
         known = ((starts >= broken[:, None]) & (starts <= broken[:, None] + 2 * window.size)).any(axis=1)
         starts = np.r_[starts, broken[~known] + window.size // 2 + 1]
-        step *= START.coarser
+        step *= START.rate_ratio
     return float(record.start_time + record.sample_time * min(starts.max(initial=0), n - 1))
 
 
@@ -121,16 +121,16 @@ def decays(record: Record) -> bool:
     about = record.outputs - record.outputs[:, -max(record.n_samples // 10, 1) :].mean(axis=1, keepdims=True)
     tenths = [float((part**2).mean()) for part in np.array_split(about, 10, axis=1) if part.size]
     falling = tenths[int(np.argmax(tenths)) :]
-    is_at_rest = tenths[-1] < START.decayed**2 * max(tenths)
-    falls = len(falling) >= START.falling and (np.diff(falling) < 0).all()
+    is_at_rest = tenths[-1] < START.decayed_ratio**2 * max(tenths)
+    falls = len(falling) >= START.falling_tenths and (np.diff(falling) < 0).all()
     return bool(is_at_rest or falls or _explained(record))
 
 
 def _explained(record: Record) -> bool:
     """Whether the record falls from the start of a decay on, and decaying modes leave little of it."""
     after = record.between(decay_start(record))
-    stride = -(-after.n_samples // START.instants)
-    sensors = slice(None, None, -(-after.n_outputs // START.signals))
+    stride = -(-after.n_samples // START.fit_samples)
+    sensors = slice(None, None, -(-after.n_outputs // START.fit_outputs))
     outputs = after.outputs[sensors, ::stride]
     outputs = outputs - outputs.mean(axis=1, keepdims=True)
     energy = [float((part**2).sum()) for part in np.array_split(outputs, 2, axis=1)]
@@ -138,11 +138,11 @@ def _explained(record: Record) -> bool:
         return False
     part = Record(stride * after.sample_time, outputs, after.output_channels[sensors])
     try:
-        poles = stacked_delays(part, n_modes=START.modes).poles
+        poles = stacked_delays(part, n_modes=START.fit_modes).poles
     except ValueError:  # too short
         return False
     left = project(part, poles[poles.real < 0], True).residual
-    return float((left**2).sum()) < START.left * float((outputs**2).sum())
+    return float((left**2).sum()) < START.max_residual_share * float((outputs**2).sum())
 
 
 def without_spikes(record: Record) -> tuple[Record, float, tuple[str, ...]]:
@@ -153,7 +153,7 @@ def without_spikes(record: Record) -> tuple[Record, float, tuple[str, ...]]:
     changes the motion.
     """
     start, remarks = decay_start(record), []
-    for _ in range(START.most_spikes):
+    for _ in range(START.max_spikes):
         at = round((start - record.start_time) / record.sample_time) - 1
         repaired = record.outputs.copy()
         spiked = [j for j, row in enumerate(repaired) if _repair(row, at)]
@@ -161,7 +161,7 @@ def without_spikes(record: Record) -> tuple[Record, float, tuple[str, ...]]:
             break
         repaired_record = replace(record, outputs=repaired)
         earlier = decay_start(repaired_record)
-        if earlier > start - START.order * record.sample_time:
+        if earlier > start - START.predictor_order * record.sample_time:
             break
         names = ", ".join(repr(record.output_names[j]) for j in spiked)
         remarks.append(
@@ -173,8 +173,8 @@ def without_spikes(record: Record) -> tuple[Record, float, tuple[str, ...]]:
 
 def _repair(row: np.ndarray, at: int) -> bool:
     """Whether a sample is a spike; if so it is replaced in place by interpolation between its neighbours."""
-    k, near = START.neighbours, START.about
-    if at < START.order or at + START.order >= row.size:
+    k, near = START.interpolation_samples, START.estimation_samples
+    if at < START.predictor_order or at + START.predictor_order >= row.size:
         return False
     part, centre = row[max(at - near, 0) : at + near + 1], min(at, near) - k
     windows = sliding_window_view(part - part.mean(), 2 * k + 1)
@@ -182,7 +182,7 @@ def _repair(row: np.ndarray, at: int) -> bool:
     others = np.abs(np.arange(len(windows)) - centre) > k
     c = np.linalg.lstsq(both[others], windows[others, k], rcond=None)[0]
     error = windows[:, k] - both @ c
-    if np.abs(error[centre]) <= START.leaps * error[others].std():
+    if np.abs(error[centre]) <= START.min_spike_ratio * error[others].std():
         return False
     row[at] -= error[centre]
     return True
@@ -191,7 +191,7 @@ def _repair(row: np.ndarray, at: int) -> bool:
 def _scaled(record: Record) -> tuple[np.ndarray, float]:
     """Strongest combinations of the outputs relative to their final values, (n_signals, n_samples), and the variance
     of their quantisation noise."""
-    outputs = record.outputs[:: -(-record.n_outputs // START.most_sensors)]
+    outputs = record.outputs[:: -(-record.n_outputs // START.max_sensors)]
     end = np.median(outputs[:, -max(record.n_samples // 10, 1) :], axis=1, keepdims=True)
     # Differences scale sensors by their motion rather than by their drift.
     size = np.array([np.linalg.norm(np.diff(row)) for row in outputs]) / np.sqrt(max(record.n_samples - 1, 1))
@@ -201,9 +201,9 @@ def _scaled(record: Record) -> tuple[np.ndarray, float]:
     scaled = outputs[moving] - end[moving]
     scaled /= size[moving, None]
     steps = [np.diff(np.unique(row)).min(initial=np.inf) for row in scaled]
-    if len(scaled) > START.most_signals:
+    if len(scaled) > START.max_combinations:
         _, directions = np.linalg.eigh(scaled @ scaled.T)
-        scaled = directions[:, -START.most_signals :].T @ scaled
+        scaled = directions[:, -START.max_combinations :].T @ scaled
     return scaled, float(np.mean(np.square(steps)) / 12.0)
 
 
@@ -213,8 +213,8 @@ def _breaks(y: np.ndarray, rounding: float) -> tuple[np.ndarray, np.ndarray]:
     Of signals y (n_signals, n_samples) with quantisation noise of variance `rounding`.
     """
     m, n = y.shape
-    order, block = START.order, START.block
-    forget, forget_level = (np.exp(-block / (k * order)) for k in (START.memory, START.level_memory))
+    order, block = START.predictor_order, START.update_samples
+    forget, forget_level = (np.exp(-block / (k * order)) for k in (START.coefficient_memory, START.level_memory))
     energy = np.r_[np.cumsum((y**2).sum(axis=0)[::-1])[::-1], 0.0]
     ridge = np.sqrt(max(rounding, 1e-24 * energy[0] / n)) * np.eye(order, order + 1)
     factor = np.zeros((0, order + 1))
@@ -235,21 +235,21 @@ def _breaks(y: np.ndarray, rounding: float) -> tuple[np.ndarray, np.ndarray]:
         factor = _triangular(rows)
     after = np.arange(1, n + 1)
     width = np.minimum(after, np.minimum(order, n - after))
-    rises = energy[after] - energy[after + width] > START.rise * (energy[after - width] - energy[after])
-    return ratio, (ratio > START.alone) | ((ratio > START.rising) & rises)
+    rises = energy[after] - energy[after + width] > START.energy_rise * (energy[after - width] - energy[after])
+    return ratio, (ratio > START.break_ratio) | ((ratio > START.rising_ratio) & rises)
 
 
 def _triangular(rows: np.ndarray) -> np.ndarray:
     """R of a QR factorisation, (at most order + 1, order + 1); directly by LAPACK, as it is called very often."""
-    factored = dgeqrf(rows)[0][: START.order + 1]
+    factored = dgeqrf(rows)[0][: START.predictor_order + 1]
     return np.asarray(factored * UPPER[: len(factored)])
 
 
 def _dying_away(ratio: np.ndarray, broken: np.ndarray) -> np.ndarray:
     """Breaks (n_samples,), with lesser breaks that follow closely on another: a force that dies away."""
-    broken, last = broken.copy(), -START.near - 1
-    for t in np.flatnonzero(ratio > START.lesser).tolist():
-        if broken[t] or t - last <= START.near:
+    broken, last = broken.copy(), -START.repeated_samples - 1
+    for t in np.flatnonzero(ratio > START.repeated_ratio).tolist():
+        if broken[t] or t - last <= START.repeated_samples:
             broken[t], last = True, t
     return broken
 
@@ -380,19 +380,19 @@ def without_drift(record: Record, poles: np.ndarray, *, most: int = HIGHEST_DEGR
     degree = int(np.argmax(ratio - penalty * m * np.arange(highest + 1)))
     likely = degree > 0 and ratio[degree] >= chi2.isf(FALSE_ALARM / highest, m * degree)
 
-    rates = np.geomspace(2.0, START.fastest * n, START.rates) / (n * dt)
-    for _ in range(START.rounds):
+    rates = np.geomspace(2.0, START.max_settling_rate * n, START.settling_rates) / (n * dt)
+    for _ in range(START.settling_rounds):
         decays, tried = with_constant.beside(_Columns.settling(dt * rates, n)).factored(record.outputs)
         drift_part = decays[fixed:, fixed:]
         each = (drift_part.T @ tried[fixed:]) ** 2 / np.maximum((drift_part**2).sum(axis=0), 1e-300)[:, None]
         settles = gain(each, tried)
         best = int(np.argmax(settles))
         rate, settling = rates[best], settles[best]
-        rates = np.geomspace(rates[max(best - 1, 0)], rates[min(best + 1, rates.size - 1)], START.rates)
+        rates = np.geomspace(rates[max(best - 1, 0)], rates[min(best + 1, rates.size - 1)], START.settling_rates)
     criterion = settling - penalty * (m + 1)
     of_polynomial = ratio[degree] - penalty * m * degree if likely else 0.0
     time_constant = None
-    if criterion > of_polynomial and settling > chi2.isf(FALSE_ALARM / START.rates, m + 1):
+    if criterion > of_polynomial and settling > chi2.isf(FALSE_ALARM / START.settling_rates, m + 1):
         columns, time_constant = with_constant.beside(_Columns.settling(np.array([dt * rate]), n)), 1.0 / float(rate)
     elif likely:
         columns = modes.beside(_Columns.polynomials(degree, n))

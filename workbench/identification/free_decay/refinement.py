@@ -351,10 +351,10 @@ def fitted_poles(
     poles: np.ndarray,
     weights: np.ndarray,
     offset: bool,
-    most_steps: int = FIT.most_steps,
+    most_steps: int = FIT.max_steps,
     *,
     hold: bool = False,
-    enough: float = FIT.negligible,
+    enough: float = FIT.cost_tolerance,
     time_limit: TimeLimit | None = None,
 ) -> tuple[np.ndarray, list[Projection], bool, int]:
     """Least squares over (σ, ω_d) of all modes.
@@ -424,7 +424,7 @@ def _inadmissible(poles: np.ndarray, records: Sequence[Record]) -> np.ndarray:
     a sample, (n_modes,)."""
     dt, longest = records[0].sample_time, max(r.n_samples * r.sample_time for r in records)
     turn = poles.imag * dt
-    growing, too_fast = poles.real * longest >= FIT.most_growth, -poles.real * dt > FIT.fastest_decay
+    growing, too_fast = poles.real * longest >= FIT.max_growth, -poles.real * dt > FIT.max_decay
     return np.asarray((turn <= 0) | (turn >= np.pi) | growing | too_fast)
 
 

@@ -216,8 +216,8 @@ class _Peak:
 
         with np.errstate(over="ignore", invalid="ignore"):
             m = motion(unknowns)
-            steps = BACKBONE.slightly * np.eye(unknowns.size)
-            return np.column_stack([m, *((motion(unknowns + step) - m) / BACKBONE.slightly for step in steps)])
+            steps = BACKBONE.difference_step * np.eye(unknowns.size)
+            return np.column_stack([m, *((motion(unknowns + step) - m) / BACKBONE.difference_step for step in steps)])
 
     def _residual(self, motions: np.ndarray) -> tuple[Floats, Floats]:
         """Residual (n,) and its Jacobian (n, n_unknowns)."""

@@ -70,7 +70,7 @@ def without_unpredictive(
         """Power of the prediction error in the second half of each record, (n_lines,), in units of the noise."""
         try:
             start = projected(half, fit.poles[list(kept)], fit.participation[list(kept)])
-            first_half = settled(half, start, SELECTION.few_steps, time_limit)
+            first_half = settled(half, start, SELECTION.trial_steps, time_limit)
             with np.errstate(over="ignore", invalid="ignore"):
                 predicted = columns(whole, first_half.poles, first_half.participation)[0] @ first_half.coefficients
                 errors = whole.as_samples((whole.values - predicted) / noise)
@@ -104,7 +104,7 @@ def without_unpredictive(
                 distorted.append(complex(fit.poles[r]))
     if kept.all():
         return fit, ()
-    return settled(data, only(data, fit, kept), SELECTION.few_steps, time_limit), tuple(distorted)
+    return settled(data, only(data, fit, kept), SELECTION.trial_steps, time_limit), tuple(distorted)
 
 
 def _first_half(record: Record) -> Record:

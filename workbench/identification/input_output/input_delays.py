@@ -258,7 +258,7 @@ def _with_free_fraction(data: KnownInputs, fit: Fit, delays: Floats, time_limit:
     """The data with inputs delayed by whole samples and any fraction, and a fit just precise enough for decisions."""
     other = data.delayed_by(delays, any_fraction=True)
     return other, settled(
-        other, _for_other_delays(other, data, fit), SELECTION.few_steps, time_limit, SELECTION.decided
+        other, _for_other_delays(other, data, fit), SELECTION.trial_steps, time_limit, SELECTION.trial_tolerance
     )
 
 
@@ -297,7 +297,7 @@ def hold_remarks(data: KnownInputs, fit: Fit, threshold: float, time_limit: Time
             other = replace(data, hold=hold).delayed_by(delays)
             try:
                 start = projected(other, fit.poles, fit.participation)
-                refitted = settled(other, start, SELECTION.few_steps, time_limit, SELECTION.decided)
+                refitted = settled(other, start, SELECTION.trial_steps, time_limit, SELECTION.trial_tolerance)
             except np.linalg.LinAlgError:
                 continue
             # a fractional delay has a row fewer

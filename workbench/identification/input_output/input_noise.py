@@ -103,7 +103,7 @@ def noise_levels(data: KnownInputs, fit: Fit, records: Sequence[Record]) -> Inpu
 
 def _residual_spectra(data: KnownInputs, fit: Fit) -> tuple[Floats, Floats]:
     """Of all records, lines of the residual (n_outputs, n_lines), and |G|² (n_inputs, n_outputs, n_lines)."""
-    responses, leverage = _impulse_responses(data, fit), np.clip(data.leverage(fit), 0.0, PROJECTION.most_taken)
+    responses, leverage = _impulse_responses(data, fit), np.clip(data.leverage(fit), 0.0, PROJECTION.max_leverage)
     lines, gains = [], []
     for rows, residual in zip(data.rows, data.left(fit), strict=True):
         lines.append(lines_of(residual) / np.sqrt(1.0 - leverage[rows]))
@@ -140,7 +140,7 @@ def _likeliest_noise(data: KnownInputs, lines: Floats, gain: Floats, highest: Fl
     """
     phase, colour = _frequencies(data) * data.dt, np.ones(lines.shape)
     filters = tuple(np.ones(1) for _ in lines)
-    for most in range(1, PROJECTION.order + 1):
+    for most in range(1, PROJECTION.max_ar_order + 1):
         # a low order first: of a high one the filter takes the peaks that the inputs explain, and leaves them slowly
         noise = InputNoise(*_likeliest_levels((lines / colour) ** 2, gain / colour**2, highest), filters)
         sensor_part = noise.sensors_at(phase) ** 2
@@ -161,7 +161,7 @@ def _likeliest_levels(power: Floats, gain: Floats, highest: Floats) -> tuple[Flo
     """
     of_outputs = 0.5 * power.mean(axis=1)
     of_inputs = 0.5 * power.mean() / np.maximum(gain.mean(axis=(1, 2)), 1e-300) / len(gain)
-    floor = PROJECTION.rounding**2 * of_outputs + 1e-300
+    floor = PROJECTION.noise_free_ratio**2 * of_outputs + 1e-300
     for _ in range(INPUT_NOISE.steps):
         total = of_outputs[:, None] + np.tensordot(of_inputs, gain, 1)
         inverse = 1.0 / total

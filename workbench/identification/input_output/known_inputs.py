@@ -409,14 +409,14 @@ class KnownInputs:
             powers = self._kept[rate] if rate in self._kept else self._powers(rate, decay, autocorrelations)
             for r, power in zip(cross_correlations, powers, strict=True):
                 score += (np.abs(np.fft.rfft(r * decay, size)) ** 2 / power).sum(axis=0)
-            score[omega <= max(0.5 * self.resolution, rate / SELECTION.most_damped)] = 0.0
+            score[omega <= max(0.5 * self.resolution, rate / SELECTION.max_damping)] = 0.0
             peaks = 1 + np.flatnonzero((score[1:-1] > score[:-2]) & (score[1:-1] >= score[2:]))
-            best = peaks[np.argsort(score[peaks])[-SELECTION.peaks_a_rate :]]
+            best = peaks[np.argsort(score[peaks])[-SELECTION.peaks_per_rate :]]
             return np.asarray(-rate + 1j * omega[best]), score[best]
 
         poles, strength = zip(*at_once(of_rate, self.rates, long=len(residual) >= MANY_ROWS), strict=True)
         order = np.argsort(np.concatenate(strength))[::-1]
-        return np.asarray(np.concatenate(poles)[order[: 3 * SELECTION.peaks_a_rate]])
+        return np.asarray(np.concatenate(poles)[order[: 3 * SELECTION.peaks_per_rate]])
 
     def _exciting(self, record: Record) -> list[Floats]:
         """The excitations of a record that are not zero, (n_samples,) each."""

@@ -361,9 +361,9 @@ def search(
     data: Measurement,
     fit: Fit,
     noise: np.ndarray,
-    most_steps: int = FIT.most_steps,
+    most_steps: int = FIT.max_steps,
     time_limit: TimeLimit | None = None,
-    negligible: float = FIT.negligible,
+    negligible: float = FIT.cost_tolerance,
     is_vain: Callable[[Fit], bool] = lambda fit: False,
 ) -> Fit:
     """Least-squares fit over poles and participation factors, outputs in units of `noise`, from a fit of the same data.
@@ -405,10 +405,10 @@ class _OutputError:
         change = (full[: full.size // 2] + 1j * full[full.size // 2 :]).reshape(n, p + 1)
         poles, participation = state.poles + change[:, 0], state.participation + change[:, 1:]
         highest, fastest_decay = self.data.highest, self.data.highest / np.pi
-        growing = poles.real > FIT.most_growth * self.data.resolution / (2.0 * np.pi)
+        growing = poles.real > FIT.max_growth * self.data.resolution / (2.0 * np.pi)
         if ((poles.imag <= 0) | (poles.imag >= highest) | (-poles.real > fastest_decay) | growing).any():
             return None, step
-        if not (np.abs(participation) < FIT.most_unlike).all():
+        if not (np.abs(participation) < FIT.max_participation_ratio).all():
             return None, step
         try:
             if self.into is None:
@@ -429,9 +429,9 @@ def only(data: Measurement, fit: Fit, kept: np.ndarray) -> Fit:
 def settled(
     data: Measurement,
     fit: Fit,
-    most_steps: int = FIT.most_steps,
+    most_steps: int = FIT.max_steps,
     time_limit: TimeLimit | None = None,
-    negligible: float = FIT.negligible,
+    negligible: float = FIT.cost_tolerance,
 ) -> Fit:
     """The fit searched, reweighted by the noise it estimates, and searched again; unchanged where the time is up.
 

@@ -153,9 +153,9 @@ def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float) -> Fi
     return projected(data, poles, np.array(participation, complex).reshape(poles.size, size // 2))
 
 
-def sure_modes(data: Measurement, start: Fit, options: SelectionOptions, times: float = SELECTION.weak) -> Fit:
-    """The fitted modes of a start that exceed the threshold several times, `SELECTION.weak` as coloured noise hardly
-    does."""
+def sure_modes(data: Measurement, start: Fit, options: SelectionOptions, times: float = SELECTION.weak_ratio) -> Fit:
+    """The fitted modes of a start that exceed the threshold several times, `SELECTION.weak_ratio` as coloured noise
+    hardly does."""
     return _Modes(data, options).started(start, times)
 
 
@@ -238,11 +238,12 @@ class _Modes:
             best = max(best, queue[k], key=lambda item: item[0])
             if k + 1 < len(queue) and best[0] >= queue[k + 1][0]:
                 break
-        return best if best[0] > SELECTION.weak * self.threshold(model, best[2]) else None
+        return best if best[0] > SELECTION.weak_ratio * self.threshold(model, best[2]) else None
 
     def extended(self, model: Fit, candidate: tuple[complex, np.ndarray]) -> Fit:
         start = self._among_near(model, *candidate)
-        return search(self.data, start, model.noise, ORDER.steps, self.time_limit, SELECTION.decided, _is_overdamped)
+        enough = SELECTION.trial_tolerance
+        return search(self.data, start, model.noise, ORDER.steps, self.time_limit, enough, _is_overdamped)
 
     def _among_near(self, model: Fit, pole: complex, participation: np.ndarray) -> Fit:
         """A model and a candidate, which in a long record is first fitted to what the modes far from it leave.
@@ -264,7 +265,8 @@ class _Modes:
             at_near = np.concatenate([near[:-1], n + near[:-1]])
             left.values = model.residual + (phi @ model.coefficients[at_near]) * row_weights(data)
             start = projected(left, poles[near], factors[near])
-            fit = search(left, start, model.noise, ORDER.steps, self.time_limit, SELECTION.decided, _is_overdamped)
+            enough = SELECTION.trial_tolerance
+            fit = search(left, start, model.noise, ORDER.steps, self.time_limit, enough, _is_overdamped)
             if not _is_overdamped(fit) and not np.delete(are_near(fit.poles[-1]), near[:-1]).any():
                 poles[near], factors[near] = fit.poles, fit.participation
         return projected(data, poles, factors)
@@ -290,7 +292,7 @@ class _Modes:
 
         Each pass removes the weaker half of these; a mode removed in error is found again by the selection.
         """
-        model = settled(self.data, start, SELECTION.few_steps, self.time_limit, SELECTION.decided)
+        model = settled(self.data, start, SELECTION.trial_steps, self.time_limit, SELECTION.trial_tolerance)
         while model.poles.size and not self.time_limit.spent("check of each mode"):
             statistic = np.where(_spurious(self.data, model), 0.0, marginal_statistics_of(model))
             is_weak = statistic < [times * self.threshold(model, pole) for pole in model.poles]
@@ -304,7 +306,7 @@ class _Modes:
     def _without(self, model: Fit, modes: int | np.ndarray) -> Fit:
         """The model without some modes, fitted just precisely enough for decisions."""
         rest = only(self.data, model, np.delete(np.arange(model.poles.size), modes))
-        return settled(self.data, rest, SELECTION.few_steps, self.time_limit, SELECTION.decided)
+        return settled(self.data, rest, SELECTION.trial_steps, self.time_limit, SELECTION.trial_tolerance)
 
     def suspects(self, model: Fit) -> Iterator[tuple[complex, Fit, bool]]:
         """The modes that are spurious, weak or close to another, each with the fit without it."""
@@ -313,10 +315,11 @@ class _Modes:
         for r, pole in enumerate(model.poles):
             if changes[r]:
                 continue
-            is_close = np.abs(np.delete(model.poles, r) - pole).min(initial=np.inf) < SELECTION.close * abs(pole.real)
+            distance = np.abs(np.delete(model.poles, r) - pole).min(initial=np.inf)
+            is_close = distance < SELECTION.close_bandwidths * abs(pole.real)
             threshold = self.threshold(model, pole)
             doubtful = is_close and statistic[r] < ORDER.distinct * threshold
-            if spurious[r] or doubtful or statistic_of(model, r) < SELECTION.weak * threshold:
+            if spurious[r] or doubtful or statistic_of(model, r) < SELECTION.weak_ratio * threshold:
                 yield complex(pole), self._without(model, r), bool(spurious[r])
 
     def _is_near(self, pole: complex, rejected: list[tuple[complex, float]]) -> bool:
@@ -461,5 +464,5 @@ def _spurious(data: Measurement, fit: Fit) -> np.ndarray:
     alike = mac(shapes, shapes) * mac(fit.participation.T, fit.participation.T)
     # one output and one input leave no shapes to compare; initial states do not count
     single_channel = shapes.shape[0] * data.n_inputs == 1
-    splits = overlapping & (alike > SELECTION.same_shape) & (strength[:, None] < strength) & (not single_channel)
+    splits = overlapping & (alike > SELECTION.min_split_mac) & (strength[:, None] < strength) & (not single_channel)
     return np.asarray(splits.any(axis=1) | overdamped(poles) | _reaches_nyquist(data, poles))

@@ -44,7 +44,7 @@ def noise_spectrum(
     """
     squares = np.array([(each**2).sum(axis=0) for each in residuals])
     measured = np.array([(each**2).sum(axis=0) for each in outputs])
-    if (squares.sum(axis=0) <= PROJECTION.rounding**2 * measured.sum(axis=0)).any():
+    if (squares.sum(axis=0) <= PROJECTION.noise_free_ratio**2 * measured.sum(axis=0)).any():
         return None
     levels = np.sqrt(variances(squares, free))
     power = [np.abs(np.fft.rfft(each, axis=0)[1:]) ** 2 for each in residuals]
@@ -52,7 +52,7 @@ def noise_spectrum(
     if flat.all() and not differ(squares, free).any():
         return None
     corrected = [
-        samples_of(lines_of(each) / np.sqrt(1.0 - np.clip(share, 0.0, PROJECTION.most_taken)))
+        samples_of(lines_of(each) / np.sqrt(1.0 - np.clip(share, 0.0, PROJECTION.max_leverage)))
         for each, share in zip(residuals, leverage, strict=True)
     ]
     std = [np.tile(row, (len(each), 1)) for row, each in zip(levels, residuals, strict=True)]
@@ -69,10 +69,11 @@ def alike(one: Sequence[np.ndarray] | None, other: Sequence[np.ndarray] | None) 
     """Whether two noise spectra are the same."""
     if one is None or other is None:
         return one is other
-    return bool(np.sqrt((np.log(np.vstack(one) / np.vstack(other)) ** 2).mean(axis=0)).max() < PROJECTION.spectra_alike)
+    log_ratios = np.log(np.vstack(one) / np.vstack(other))
+    return bool(np.sqrt((log_ratios**2).mean(axis=0)).max() < PROJECTION.spectrum_tolerance)
 
 
-def autoregression(rows: Sequence[np.ndarray], most: int = PROJECTION.order) -> tuple[np.ndarray, float]:
+def autoregression(rows: Sequence[np.ndarray], most: int = PROJECTION.max_ar_order) -> tuple[np.ndarray, float]:
     """The prediction error filter [1, -a_1, ...] of records (n_samples,) of one noise (Burg 1967), and the BIC of its
     order, least up to the order `most`."""
     n = sum(row.size for row in rows)
@@ -80,7 +81,7 @@ def autoregression(rows: Sequence[np.ndarray], most: int = PROJECTION.order) -> 
     best = coefficients = np.ones(1)
     variance = sum(float(row @ row) for row in rows) / n
     least_criterion = n * np.log(variance)
-    for order in range(1, min(most, n // PROJECTION.samples_each) + 1):
+    for order in range(1, min(most, n // PROJECTION.samples_per_parameter) + 1):
         forward, backward = [f[1:] for f in forward], [b[:-1] for b in backward]
         cross = sum(float(f @ b) for f, b in zip(forward, backward, strict=True))
         k = -2.0 * cross / sum(float(f @ f + b @ b) for f, b in zip(forward, backward, strict=True))

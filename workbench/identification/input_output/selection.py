@@ -147,7 +147,7 @@ def _select_weighted(
     """
     time_limit, check = options.time_limit, "check of doubtful modes"
     data, selected = _alternate_with_noise(data, strongest, _few_of(options, strongest.fit.poles.size), options)
-    doubtful = (selected.statistic < SELECTION.weak * selected.limit) | ~_are_oscillatory(data, selected)
+    doubtful = (selected.statistic < SELECTION.weak_ratio * selected.limit) | ~_are_oscillatory(data, selected)
     if data.line_std is None or not doubtful.any() or time_limit.spent(check):
         return data, selected
     sure = settled(data, only(data, selected.fit, ~doubtful), time_limit=time_limit)
@@ -164,7 +164,7 @@ def _select_weighted(
 def _are_oscillatory(data: KnownInputs, selected: SelectedModes) -> np.ndarray:
     """Whether each mode oscillates within a record and does not grow, (n_modes,); others may be coloured noise."""
     poles, span = selected.fit.poles, 2.0 * np.pi / data.resolution
-    return np.asarray((np.abs(poles) > data.resolution) & (poles.real * span < SELECTION.most_growth))
+    return np.asarray((np.abs(poles) > data.resolution) & (poles.real * span < SELECTION.max_growth))
 
 
 def _alternate_with_noise(

@@ -127,7 +127,7 @@ class Lines:
         for rate in self.rates:
             x = 1.0 / (1j * (self.omega - self.omega[lines, None]) + rate)
             score = (np.abs(raw @ x.conj().T) ** 2).sum(axis=0) / (np.abs(x) ** 2 * weight).sum(axis=1)
-            score[rate > SELECTION.most_damped * self.omega[lines]] = 0.0
+            score[rate > SELECTION.max_damping * self.omega[lines]] = 0.0
             best = np.argsort(score)[-LINES.peaks_a_rate :]
             poles.append(-rate + 1j * self.omega[lines[best]])
             strength.append(score[best])

@@ -142,7 +142,7 @@ def beside_changing(
         if removed[r] or not others.size or time_limit.spent(CHANGE_CHECK):
             continue
         kept = np.delete(np.arange(fit.poles.size), others)
-        one = settled(data, only(data, fit, kept), SELECTION.few_steps, time_limit)
+        one = settled(data, only(data, fit, kept), SELECTION.trial_steps, time_limit)
         at = int(np.searchsorted(kept, r))
         motion = _motion(data, one.poles[at], one.participation[at])
         decrease = added_misfit(one, fit, fit.noise)

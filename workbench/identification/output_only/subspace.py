@@ -31,24 +31,24 @@ from workbench.structure.modes import mac
 class SubspaceSettings:
     """Constants of canonical variate analysis over orders and rates."""
 
-    past: int = 40  # samples of the past and of the future
-    least_order: int = 8  # lower and upper limit of the highest model order
-    most_order: int = 40
-    decimation: int = 4  # ratio of each sampling rate to the next
-    most_decimation: int = 16  # ratio of the record's sampling rate to the lowest
-    least_samples: int = 400  # that must remain at a reduced rate: ten times the past
-    passband: float = 0.7  # of the Nyquist frequency, up to which the decimation filter does not affect modes
-    regularised: float = 1e-9  # of the variance of each output, added so that outputs without noise are not singular
-    least_periods: float = 1.0  # of a mode within the past, unless there is no lower rate
-    most_damped: float = 0.25  # damping ratio above which a pole is no mode
-    near: float = 0.02  # largest relative distance of a mode from order to order
-    least_mac: float = 0.7  # of a mode from order to order
-    presence: float = 0.4  # least share of all orders at which a mode is found
-    persistence: float = 0.75  # least share of the orders from the first at which it is found
-    most_taken: int = 10  # orders at which a mode's errors are estimated
-    averaged: int = 3  # orders of least error over which a pole is averaged
-    blocks: int = 12  # of the jackknife
-    least_blocks: int = 4  # that are evaluated whatever the time
+    past: int = 40  # samples of the past, and of the future
+    min_order: int = 8  # lower and upper limit of the highest model order
+    max_order: int = 40
+    rate_ratio: int = 4  # of each sampling rate to the next
+    max_decimation: int = 16  # ratio of the record's sampling rate to the lowest
+    min_samples: int = 400  # that must remain at a reduced rate: ten times the past
+    passband_share: float = 0.7  # of the Nyquist frequency, up to which the decimation filter does not affect modes
+    regularisation: float = 1e-9  # of the variance of each output, so that outputs without noise are not singular
+    min_periods: float = 1.0  # of a mode within the past, unless there is no lower rate
+    max_damping: float = 0.25  # ratio above which a pole is no mode
+    pole_tolerance: float = 0.02  # relative distance of a mode from order to order
+    min_mac: float = 0.7  # of a mode from order to order
+    min_presence: float = 0.4  # share of all orders at which a mode is found
+    min_persistence: float = 0.75  # share of the orders from the first at which it is found
+    max_jackknifed: int = 10  # orders at which a mode's errors are estimated
+    averaged_orders: int = 3  # of least error, over which a pole is averaged
+    jackknife_blocks: int = 12
+    min_blocks: int = 4  # that are evaluated whatever the time
 
 
 SUBSPACE = SubspaceSettings()
@@ -76,9 +76,9 @@ class Subspace:
         self.n_outputs, self.n_samples = outputs.shape
         values, decimation = outputs - outputs.mean(axis=1, keepdims=True), 1
         self._outputs: dict[int, np.ndarray] = {}
-        while decimation == 1 or (values.shape[1] >= SUBSPACE.least_samples and decimation <= SUBSPACE.most_decimation):
+        while decimation == 1 or (values.shape[1] >= SUBSPACE.min_samples and decimation <= SUBSPACE.max_decimation):
             self._outputs[decimation] = values
-            values, decimation = resample_poly(values, 1, SUBSPACE.decimation, axis=1), SUBSPACE.decimation * decimation
+            values, decimation = resample_poly(values, 1, SUBSPACE.rate_ratio, axis=1), SUBSPACE.rate_ratio * decimation
 
     def stable(self) -> list[StablePole]:
         """The poles that are stable over the orders, each from the sampling rate of its largest presence."""
@@ -98,23 +98,23 @@ class Subspace:
         if not modes:
             return []
         jackknife: list[list[np.ndarray]] = []
-        for b in range(SUBSPACE.blocks):
-            if b >= SUBSPACE.least_blocks and time_limit.spent("standard errors"):
+        for b in range(SUBSPACE.jackknife_blocks):
+            if b >= SUBSPACE.min_blocks and time_limit.spent("standard errors"):
                 break
             jackknife.append(self._poles_without(b, modes))
         n = len(jackknife)
-        scale = (student.ppf(0.975, n - 1) / student.ppf(0.975, np.inf)) ** 2 * (SUBSPACE.blocks - 1) / n
+        scale = (student.ppf(0.975, n - 1) / student.ppf(0.975, np.inf)) ** 2 * (SUBSPACE.jackknife_blocks - 1) / n
         estimates = []
         for r, mode in enumerate(modes):
             replicates = np.array([one[r] for one in jackknife])
             deviation = replicates - replicates.mean(axis=0)
             # A low order has bias, a high order variance by over-fitting.
             error = scale * (np.abs(deviation) ** 2).sum(axis=0) + np.abs(np.array(mode.poles) - mode.pole) ** 2
-            best = np.argsort(error)[: SUBSPACE.averaged]
+            best = np.argsort(error)[: SUBSPACE.averaged_orders]
             deviation = deviation[:, best].mean(axis=1)
             parts = np.stack([deviation.real, deviation.imag])
             pole = complex(np.array(mode.poles)[best].mean())
-            block = 2.0 * abs(pole.real) * self.n_samples * self.sample_time / SUBSPACE.blocks
+            block = 2.0 * abs(pole.real) * self.n_samples * self.sample_time / SUBSPACE.jackknife_blocks
             variance = scale / (1.0 - (1.0 - np.exp(-block)) / block) * parts @ parts.T
             estimates.append(replace(mode, pole=pole, variance=variance))
         return estimates
@@ -124,7 +124,7 @@ class Subspace:
         poles = [np.zeros(0)] * len(modes)
         for decimation in {mode.decimation for mode in modes}:
             remaining, dt = self._outputs[decimation].copy(), decimation * self.sample_time
-            first, last = (remaining.shape[1] * b // SUBSPACE.blocks for b in (block, block + 1))
+            first, last = (remaining.shape[1] * b // SUBSPACE.jackknife_blocks for b in (block, block + 1))
             remaining[:, first:last] = 0.0
             model = Model(_covariances(remaining, 2 * SUBSPACE.past + 1))
             of_rate = [r for r, mode in enumerate(modes) if mode.decimation == decimation]
@@ -137,22 +137,22 @@ class Subspace:
     def _at_one_rate(self, decimation: int) -> list[StablePole]:
         """The poles that are stable over the orders at one sampling rate."""
         dt = decimation * self.sample_time
-        top = np.pi * (1.0 if decimation == 1 else SUBSPACE.passband) / dt
-        low = 0.0 if decimation == max(self._outputs) else 2.0 * np.pi * SUBSPACE.least_periods / (SUBSPACE.past * dt)
+        top = np.pi * (1.0 if decimation == 1 else SUBSPACE.passband_share) / dt
+        low = 0.0 if decimation == max(self._outputs) else 2.0 * np.pi * SUBSPACE.min_periods / (SUBSPACE.past * dt)
         model = Model(_covariances(self._outputs[decimation], 2 * SUBSPACE.past + 1))
         groups: list[list[StablePole]] = []
         orders = range(2, model.highest_order(self._outputs[decimation].shape[1]) + 1, 2)
         for order in reversed(orders):
             log_mu, shapes, gains = model.poles(order, statistic=True)
             for pole, shape, gain in zip(log_mu / dt, shapes.T, gains, strict=True):
-                if not (0 < -pole.real < SUBSPACE.most_damped * abs(pole) and low < abs(pole) < top):
+                if not (0 < -pole.real < SUBSPACE.max_damping * abs(pole) and low < abs(pole) < top):
                     continue
                 gain *= self.n_samples / decimation
                 found = complex(pole)
                 mode = StablePole(found, shape, 0.0, gain, (order,), (found,), decimation, np.full((2, 2), np.nan))
                 others = [group for group in groups if group[-1].orders[0] != order]
                 distances = [_distance(mode, group[-1]) for group in others]
-                if min(distances, default=np.inf) < SUBSPACE.near:
+                if min(distances, default=np.inf) < SUBSPACE.pole_tolerance:
                     others[int(np.argmin(distances))].append(mode)
                 else:
                     groups.append([mode])
@@ -167,14 +167,14 @@ def _nearest(poles: np.ndarray, pole: complex) -> complex:
 def _is_stable(group: Sequence[StablePole], orders: range) -> bool:
     """Whether the poles of a group are present at enough of the model orders."""
     possible = sum(order >= group[-1].orders[0] for order in orders)
-    return len(group) >= max(SUBSPACE.presence * len(orders), SUBSPACE.persistence * possible)
+    return len(group) >= max(SUBSPACE.min_presence * len(orders), SUBSPACE.min_persistence * possible)
 
 
 def _median_mode(group: Sequence[StablePole], orders: range) -> StablePole:
     """The mode nearest the median of a group, with the orders and poles for its errors."""
     poles = np.array([mode.pole for mode in group])
     nearest = int(np.argmin(np.abs(poles - np.median(poles.real) - 1j * np.median(poles.imag))))
-    taken = group[:: 1 + len(group) // SUBSPACE.most_taken]
+    taken = group[:: 1 + len(group) // SUBSPACE.max_jackknifed]
     orders_taken, poles_taken = zip(*((mode.orders[0], mode.pole) for mode in taken))
     return replace(group[nearest], presence=len(group) / len(orders), orders=orders_taken, poles=poles_taken)
 
@@ -185,7 +185,7 @@ class Model:
     def __init__(self, lags: np.ndarray) -> None:
         m = lags.shape[1]
         lags = lags.copy()
-        lags[0] += SUBSPACE.regularised * np.diag(np.diag(lags[0]))
+        lags[0] += SUBSPACE.regularisation * np.diag(np.diag(lags[0]))
         both = np.concatenate([lags[:0:-1].transpose(0, 2, 1), lags])
         i, j = np.indices((SUBSPACE.past, SUBSPACE.past))
         past, future, between = (
@@ -195,14 +195,14 @@ class Model:
         root, future_root = np.linalg.cholesky(past), np.linalg.cholesky(future)
         whitened = solve_triangular(future_root, between, lower=True)
         _, self._correlations, canonical = np.linalg.svd(solve_triangular(root, whitened.T, lower=True).T)
-        state = solve_triangular(root.T, canonical[: SUBSPACE.most_order].T, lower=False).T
+        state = solve_triangular(root.T, canonical[: SUBSPACE.max_order].T, lower=False).T
         self._covariance, self._c = lags[0], between[:m] @ state.T
         self._a = state @ np.vstack([between[:m], past[:-m]]) @ state.T
 
     def highest_order(self, n_samples: int) -> int:
         """Twice the number of canonical correlations above those of noise (Johnstone 2001), within limits."""
         noise = 2.0 * np.sqrt(self._c.shape[0] * SUBSPACE.past / n_samples)
-        return int(np.clip(2 * np.sum(self._correlations > noise), SUBSPACE.least_order, SUBSPACE.most_order))
+        return int(np.clip(2 * np.sum(self._correlations > noise), SUBSPACE.min_order, SUBSPACE.max_order))
 
     def poles(self, order: int, statistic: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The poles of a model in the upper half plane, as ln μ (n_poles,) of the discrete poles μ.
@@ -225,7 +225,7 @@ class Model:
 
 def _distance(one: StablePole, other: StablePole) -> float:
     """Relative distance of two poles; infinite where their shapes differ."""
-    if mac(one.shape[:, None], other.shape[:, None])[0, 0] < SUBSPACE.least_mac:
+    if mac(one.shape[:, None], other.shape[:, None])[0, 0] < SUBSPACE.min_mac:
         return np.inf
     return abs(one.pole - other.pole) / abs(other.pole)
 
@@ -233,7 +233,7 @@ def _distance(one: StablePole, other: StablePole) -> float:
 def _same(one: StablePole, other: StablePole) -> bool:
     """Whether poles of two sampling rates are the same mode, to within half a bandwidth."""
     half_widths = 0.5 * (abs(one.pole.real) + abs(other.pole.real)) / abs(other.pole)
-    return _distance(one, other) < 0.25 * SUBSPACE.near + half_widths
+    return _distance(one, other) < 0.25 * SUBSPACE.pole_tolerance + half_widths
 
 
 def _covariances(outputs: np.ndarray, n_lags: int) -> np.ndarray:

@@ -56,17 +56,17 @@ class BandsSettings:
     """Constants of bands and of the boundary condition check."""
 
     draws: int = 4000  # Monte Carlo samples of the largest error: its 0.95 quantile to a hundredth
-    held: float = 1e-6  # of the largest standard error: below it a boundary condition fixes the curve
-    order: int = 4  # p, of the derivative taken as white
-    cells: int = 400  # of the structure, on which Peano's kernel is evaluated
-    # chance that noise alone is taken for interpolation error, and that τ² exceeds its upper limit
-    unlikely: float = 0.05
-    # of the splines of the check, in this order: the higher degree extrapolates further from fewer sensors, and has
-    # larger errors where a mode is short for its sensors
-    degrees: tuple[int, ...] = (5, 3)
+    min_error_ratio: float = 1e-6  # to the largest standard error: below it a boundary condition fixes the curve
+    derivative_order: int = 4  # p, of the derivative taken as white
+    kernel_cells: int = 400  # of the structure, on which Peano's kernel is evaluated
+    # that noise alone is taken for interpolation error, and that τ² exceeds its upper limit
+    error_probability: float = 0.05
+    # of the check, in this order: the higher degree extrapolates further from fewer sensors, and has larger errors
+    # where a mode is short for its sensors
+    spline_degrees: tuple[int, ...] = (5, 3)
     # of the variance of each derivative, added independently: the accuracy of their ratio in the kernel's model
-    of_its_own: float = 0.01
-    refused: float = 1e-4  # chance that a correct boundary condition is refused
+    independent_share: float = 0.01
+    refusal_probability: float = 1e-4  # of a correct boundary condition
 
 
 BANDS = BandsSettings()
@@ -80,13 +80,13 @@ def peano_kernel(
 
     The sum of squares of a row is the mean square error for τ² = 1. `x` (n_points,), `positions` (n_sensors,), m.
     """
-    order = min(BANDS.order, spline.degree + 1)
-    u = (np.arange(BANDS.cells) + 0.5) * length / BANDS.cells
+    order = min(BANDS.derivative_order, spline.degree + 1)
+    u = (np.arange(BANDS.kernel_cells) + 0.5) * length / BANDS.kernel_cells
     interpolated = spline.matrix(x, derivative) @ _power(positions, u, order)
     if spline.conditions:
         of_conditions = np.array([_power(np.array([at]), u, order, d)[0] for at, d in spline.conditions])
         interpolated = interpolated + spline.of_held(x, derivative) @ of_conditions
-    return np.asarray((_power(x, u, order, derivative) - interpolated) * np.sqrt(length / BANDS.cells))
+    return np.asarray((_power(x, u, order, derivative) - interpolated) * np.sqrt(length / BANDS.kernel_cells))
 
 
 class LeaveOneOut:
@@ -113,7 +113,7 @@ class LeaveOneOut:
         noise_variance = np.diag(noise)
         # scaled χ² of error.size / scale degrees of freedom (Satterthwaite)
         scale = np.sum(noise**2 / np.outer(noise_variance, noise_variance)) / error.size
-        if (error**2 / noise_variance).sum() < scale * chi2.isf(BANDS.unlikely, error.size / scale):
+        if (error**2 / noise_variance).sum() < scale * chi2.isf(BANDS.error_probability, error.size / scale):
             return 0.0
         return self.roughest(values, covariance)
 
@@ -128,7 +128,7 @@ class LeaveOneOut:
 
         log_upper = np.log((np.maximum(error**2, noise_variance) / unit_variance).max())
         best = minimize_scalar(cost, bounds=(log_upper - 20.0, log_upper), method="bounded")
-        limit = best.fun + chi2.isf(2.0 * BANDS.unlikely, 1)
+        limit = best.fun + chi2.isf(2.0 * BANDS.error_probability, 1)
         return float(np.exp(brentq(lambda log_strength: cost(log_strength) - limit, best.x, log_upper + 20.0)))
 
     def _errors(self, values: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -160,13 +160,13 @@ def check_ends(found: ShapeEstimates, ends: BoundaryConditions, *, length: float
         value, std, statistic = np.zeros((3, values.shape[1], len(conditions)))
         for r, (v, noise) in enumerate(zip(values.T, found.shape_covariance, strict=True)):
             covariance = rows @ noise @ rows.T + leave_one_out.roughest(v, noise) * error @ error.T
-            precision = np.linalg.inv(covariance + BANDS.of_its_own * np.diag(np.diag(covariance)))
+            precision = np.linalg.inv(covariance + BANDS.independent_share * np.diag(np.diag(covariance)))
             # Estimate and standard error of each derivative, given that the others are zero.
             std[r] = 1.0 / np.sqrt(np.diag(precision))
             value[r] = precision @ rows @ v * std[r] ** 2
             statistic[r] = rows @ v * (precision @ rows @ v)
         chance = float(chi2.sf(statistic.sum(), statistic.size))
-        if chance < BANDS.refused:
+        if chance < BANDS.refusal_probability:
             r, k = divmod(int(np.argmax(np.abs(value / std))), len(conditions))
             rest = ", given the rest" if len(conditions) > 1 else ""
             zero = " and ".join(DERIVATIVES[d] for d in conditions)
@@ -188,7 +188,7 @@ def _extrapolated(
     """
     options: dict[str, Any] = {"length": length, "ends": others}
     x = np.array([at])
-    for degree in BANDS.degrees:
+    for degree in BANDS.spline_degrees:
         try:
             spline = interpolating_spline(positions, degree=degree, **options)
             leave_one_out = LeaveOneOut(positions, degree=degree, **options)
@@ -253,7 +253,7 @@ class Bands(Printed):
 def deviation_and_width(root: np.ndarray, level: float, rng: np.random.Generator) -> tuple[np.ndarray, float]:
     """Standard errors (n_points,) of a curve of error covariance R Rᵀ, by R, and the width of its simultaneous band."""
     std = np.linalg.norm(root, axis=1)
-    uncertain = std > BANDS.held * std.max()
+    uncertain = std > BANDS.min_error_ratio * std.max()
     if not uncertain.any():
         return std, 0.0
     samples = (root[uncertain] / std[uncertain, None]) @ rng.standard_normal((root.shape[1], BANDS.draws))

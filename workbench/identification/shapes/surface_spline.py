@@ -196,7 +196,7 @@ class SurfaceSpline:
         mean_variance = float(np.trace(unit_covariance)) / len(contrast_values)
         span = np.log(scale / mean_variance) + np.array([-40.0, 25.0])
         best = minimize_scalar(cost, bounds=tuple(span), method="bounded")
-        limit = best.fun + chi2.isf(2.0 * BANDS.unlikely, 1)
+        limit = best.fun + chi2.isf(2.0 * BANDS.error_probability, 1)
         if cost(span[0]) < limit:
             return 0.0
         return float(np.exp(brentq(lambda log_strength: cost(log_strength) - limit, best.x, span[1])))

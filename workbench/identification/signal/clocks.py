@@ -19,14 +19,15 @@ from workbench.structure.modes import SampledModes
 class ClocksSettings:
     """Constants of the search for delayed sensors."""
 
-    far: float = 0.1  # least distance of a complex shape from the nearest real one, relative to its norm
-    periods: float = 4.0  # longest delay, in periods of the highest mode
-    steps: int = 200  # trial delays per period
-    least: float = 0.1  # least entry of a shape whose phase counts, relative to the norm of the shape
-    phase: float = 0.1  # rad rms; least phase of complex residues
-    refined: float = 0.01  # rad rms; likewise, once a delay was found
-    ratio: float = 0.01  # largest relative difference of frequencies that is attributed to sample rates
-    small: float = 0.01  # probability that a delay by chance reduces the small phases of damped modes so far
+    min_shape_distance: float = 0.1  # of a complex shape from the nearest real one, relative to its norm
+    max_delay_periods: float = 4.0  # of the highest mode
+    steps_per_period: int = 200  # trial delays
+    min_shape_entry: float = 0.1  # whose phase counts, relative to the norm of the shape
+    min_phase: float = 0.1  # rad rms; of complex residues
+    min_refined_phase: float = 0.01  # rad rms; likewise, once a delay was found
+    max_rate_difference: float = 0.01  # relative difference of frequencies that is attributed to sample rates
+    # that a delay by chance reduces the small phases of damped modes so far
+    chance_probability: float = 0.01
 
 
 CLOCKS = ClocksSettings()
@@ -47,7 +48,7 @@ def shape_errors(estimates: ShapeEstimates) -> np.ndarray:
 
 def are_far(far: np.ndarray, error: np.ndarray) -> np.ndarray:
     """Indices of modes whose relative distance from the nearest real one, (n_modes,), exceeds its error."""
-    return np.flatnonzero(far > np.maximum(CLOCKS.far, SURE * error))
+    return np.flatnonzero(far > np.maximum(CLOCKS.min_shape_distance, SURE * error))
 
 
 def shape_remarks(estimates: ShapeEstimates, names: Sequence[str], only: Sequence[int]) -> tuple[str, ...]:
@@ -82,7 +83,7 @@ def _delayed_sensor(modes: SampledModes) -> tuple[int, float] | None:
     """
     omega, candidates = modes.poles.imag, []
     for j, own in enumerate(modes.shapes):
-        visible = np.abs(own) > CLOCKS.least * np.linalg.norm(modes.shapes, axis=0)
+        visible = np.abs(own) > CLOCKS.min_shape_entry * np.linalg.norm(modes.shapes, axis=0)
         if np.count_nonzero(visible) < 2:
             continue
         phases = np.angle(own) - 0.5 * np.angle((np.delete(modes.shapes, j, axis=0) ** 2).sum(axis=0))
@@ -93,7 +94,7 @@ def _delayed_sensor(modes: SampledModes) -> tuple[int, float] | None:
         return None
     corrected = modes.shapes.copy()
     corrected[j] *= np.exp(modes.poles * seconds)
-    if (far_from_real(replace(modes, shapes=corrected)) > CLOCKS.far).any():
+    if (far_from_real(replace(modes, shapes=corrected)) > CLOCKS.min_shape_distance).any():
         return None
     return j, seconds
 
@@ -107,7 +108,7 @@ def clock_remarks(estimates: ModalEstimates, only: Sequence[int]) -> tuple[str, 
     omega, zeta, omega_std, zeta_std = (values[list(only)].reshape(-1, 2).T for values in both)
     ratio, error = omega[1] / omega[0] - 1.0, np.hypot(*(omega_std / omega))
     mean = np.average(ratio, weights=error**-2)
-    separate = (SURE * error < ratio) & (ratio < CLOCKS.ratio)
+    separate = (SURE * error < ratio) & (ratio < CLOCKS.max_rate_difference)
     alike = (np.abs(ratio - mean) < SURE * error) & (np.abs(np.diff(zeta, axis=0)[0]) < SURE * np.hypot(*zeta_std))
     if not (separate & alike).all():
         return ()
@@ -117,7 +118,7 @@ def clock_remarks(estimates: ModalEstimates, only: Sequence[int]) -> tuple[str, 
     )
 
 
-def late_outputs(residues: np.ndarray, poles: np.ndarray, least: float = CLOCKS.phase) -> Floats:
+def late_outputs(residues: np.ndarray, poles: np.ndarray, least: float = CLOCKS.min_phase) -> Floats:
     """Delay of each output relative to the inputs, (n_outputs,) s; 0 where the phases of its modes do not show one.
 
     One delay for all outputs is tried first, then one for each. Neighbours within a half-power bandwidth count as one
@@ -147,22 +148,23 @@ def late_outputs(residues: np.ndarray, poles: np.ndarray, least: float = CLOCKS.
         weights = share[:, which, None] ** 2 * at[:, None, None]
         before, after = np.sqrt((weights * errors**2).sum(axis=(0, 1)) / weights.sum())
         significant = chance * squares.shape[1] < FALSE_ALARM and before > least
-        small = after < CLOCKS.phase and after < CLOCKS.small ** (1.0 / (np.count_nonzero(at) - 1)) * before
+        by_chance = CLOCKS.chance_probability ** (1.0 / (np.count_nonzero(at) - 1))
+        small = after < CLOCKS.min_phase and after < by_chance * before
         return seconds if significant and small else 0.0
 
     each = np.arange(squares.shape[1])
     together = delay_of(each, np.ones(omega.size, bool))
     if together:
         return np.full(each.size, together)
-    return np.array([delay_of(each[j : j + 1], share[:, j] > CLOCKS.least) for j in each])
+    return np.array([delay_of(each[j : j + 1], share[:, j] > CLOCKS.min_shape_entry) for j in each])
 
 
 def _delay_of_phases(phases: np.ndarray, omega: np.ndarray, fastest: float) -> tuple[float, float]:
     """The delay, s, that fits phases (n_modes,) modulo π best, and the probability of such a fit by chance."""
-    longest = CLOCKS.periods * 2.0 * np.pi / fastest
-    times = np.linspace(-longest, longest, int(2 * CLOCKS.periods * CLOCKS.steps) + 1)
+    longest = CLOCKS.max_delay_periods * 2.0 * np.pi / fastest
+    times = np.linspace(-longest, longest, int(2 * CLOCKS.max_delay_periods * CLOCKS.steps_per_period) + 1)
     coarse = times[np.argmin(_phase_error(phases, omega, times))]
-    fine = coarse + np.linspace(-1.0, 1.0, 2 * CLOCKS.steps + 1) * (times[1] - times[0])
+    fine = coarse + np.linspace(-1.0, 1.0, 2 * CLOCKS.steps_per_period + 1) * (times[1] - times[0])
     errors = _phase_error(phases, omega, fine)
     seconds = float(fine[np.argmin(errors)])
     delta = max(float(errors.min()), (fine[1] - fine[0]) * fastest)

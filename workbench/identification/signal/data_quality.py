@@ -16,33 +16,33 @@ from workbench.structure.printed import place_text
 class DataSettings:
     """Constants of the checks of a record."""
 
-    fewest_values: int = 4  # distinct values of a working sensor, at least
+    min_values: int = 4  # distinct ones of a working sensor
     # A clipped signal has at least so many samples at the end of its range, and so many times those at the next value.
     # A rounded oscillation has at most 1 / (√2 - 1) = 2.4 times as many in its last step as in the one before.
-    least_piled: int = 8
-    piled: float = 6.0
+    min_clipped_samples: int = 8
+    min_clipped_ratio: float = 6.0
     # Likewise for inputs, whose impacts are short: rounded sines and pulses have more in 3 of a thousand.
-    least_piled_input: int = 4
-    piled_input: float = 4.0
-    turning: float = 1e-6  # rounding difference between the neighbours of a sine's turning point, over the range
-    held: float = 0.5  # share of repeated samples in the outer half of an input's range from which on it has levels
-    whole: float = 1e-3  # deviation of rounded readings from multiples of the step, in steps
-    fewest_changes: int = 16  # of an output, to detect the rate at which it was held
-    slowest: int = 64  # longest hold, samples; an output that changes less often is at rest
-    copied: float = 1e-2  # largest difference between copies, relative to the standard deviation of the innovation
+    min_input_samples: int = 4
+    min_input_ratio: float = 4.0
+    turning_tolerance: float = 1e-6  # rounding between the neighbours of a sine's turning point, over the range
+    max_repeated_share: float = 0.5  # of samples in the outer half of an input's range, above which it has levels
+    step_tolerance: float = 1e-3  # deviation of rounded readings from multiples of the step, in steps
+    min_changes: int = 16  # of an output, to detect the rate at which it was held
+    max_hold_samples: int = 64  # an output that changes less often is at rest
+    copy_tolerance: float = 1e-2  # difference between copies, relative to the standard deviation of the innovation
     predictor_order: int = 16  # samples that predict the next
-    longest: int = 20_000  # samples that are compared to detect copies
-    noise_free: float = 1e-9  # innovation over the signal below which sensors of a single mode may be alike
-    fewest_equal: int = 4  # consecutive samples of a dropout, at least; a turning point has fewer
-    about: int = 32  # samples on either side of a dropout, which show the motion there
-    straight: float = 1e-9  # rounding deviation of samples from a straight line, relative to the output's range
-    moves: float = 100.0  # least motion from sample to sample there, in resolutions of the output
-    block: int = 256  # outputs compared with all others at once: all pairs of 10,000 would take 800 MB
-    parts: int = 50  # into which a record is divided, in the search for a burst of the residual
-    samples: int = 10  # of each part at least
-    together: int = 3  # consecutive parts that hold the burst
-    share: float = 0.3  # of the residual energy in these at least, where noise has 0.06
-    times: float = 2.5  # the share expected from the motion in these, at least
+    max_compared_samples: int = 20_000  # to detect copies
+    noise_free_ratio: float = 1e-9  # innovation over the signal below which sensors of a single mode may be alike
+    min_dropout_samples: int = 4  # consecutive equal ones; a turning point has fewer
+    motion_samples: int = 32  # on either side of a dropout, which show the motion there
+    line_tolerance: float = 1e-9  # rounding deviation of samples from a straight line, relative to the output's range
+    min_motion_ratio: float = 100.0  # from sample to sample there, in resolutions of the output
+    batch_size: int = 256  # outputs compared with all others at once: all pairs of 10,000 would take 800 MB
+    n_parts: int = 50  # into which a record is divided, in the search for a burst of the residual
+    min_part_samples: int = 10
+    burst_parts: int = 3  # consecutive parts that hold the burst
+    min_burst_share: float = 0.3  # of the residual energy, where noise has 0.06
+    min_burst_ratio: float = 2.5  # of that share to the one expected from the motion
 
 
 DATA = DataSettings()
@@ -91,7 +91,7 @@ def input_faults(record: Record) -> tuple[DataFault, ...]:
     """
     faults = []
     for channel, row in zip(record.input_channels, record.inputs, strict=True):
-        piled = [a for a in _piled(row).values() if _piles_up(row, a, DATA.least_piled_input, DATA.piled_input)]
+        piled = [a for a in _piled(row).values() if _piles_up(row, a, DATA.min_input_samples, DATA.min_input_ratio)]
         stops = [at for at in piled if row[at[0]] and not _has_levels(row, at)]
         if stops:
             ends, count = " and ".join(f"{row[at[0]]:g}" for at in stops), sum(at.size for at in stops)
@@ -175,21 +175,22 @@ def dropouts(record: Record) -> tuple[tuple[str, float, int, str], ...]:
     """
     result = []
     for name, row in zip(record.output_names, record.outputs, strict=True):
-        rounding, ends = DATA.straight * np.ptp(row), (row.min(), row.max())
+        rounding, ends = DATA.line_tolerance * np.ptp(row), (row.min(), row.max())
         resolution, taken, lost = 0.0, np.zeros(row.size, bool), []
         for order, how in ((1, "stays at one value"), (2, "is linear in time")):
             moves = np.abs(np.diff(row, order))
             still = np.flatnonzero(moves <= rounding)
-            if still.size < DATA.fewest_equal - 1:
+            if still.size < DATA.min_dropout_samples - 1:
                 continue
             resolution = resolution or max(np.diff(np.unique(row)).min(initial=np.inf), rounding)
             for run in np.split(still, np.flatnonzero(np.diff(still) > 1) + 1):
-                if run.size < DATA.fewest_equal - 1:
+                if run.size < DATA.min_dropout_samples - 1:
                     continue
                 first, last = int(run[0]), int(run[-1]) + order
-                about = moves[max(first - DATA.about, 0) : first], moves[last : last + DATA.about]
+                about = moves[max(first - DATA.motion_samples, 0) : first], moves[last : last + DATA.motion_samples]
                 moving = min(float(np.median(part)) if part.size > 1 else 0.0 for part in about)
-                if moving > DATA.moves * resolution and row[first] not in ends and not taken[first : last + 1].any():
+                moved = moving > DATA.min_motion_ratio * resolution
+                if moved and row[first] not in ends and not taken[first : last + 1].any():
                     taken[first : last + 1] = True
                     lost.append((name, float(record.time[first]), last - first + 1, how))
         result += sorted(lost)
@@ -228,22 +229,23 @@ def burst_remarks(records: Sequence[Record], residuals: Sequence[Floats], noise:
 
 def _burst(record: Record, residual: Floats, noise: Floats) -> tuple[str, ...]:
     motion = record.outputs[:, -len(residual) :].T
-    noise_free = noise < DATA.noise_free * motion.std(axis=0)
-    if len(residual) < DATA.parts * DATA.samples or noise_free.all():
+    noise_free = noise < DATA.noise_free_ratio * motion.std(axis=0)
+    if len(residual) < DATA.n_parts * DATA.min_part_samples or noise_free.all():
         return ()
     residual = residual / noise
     motion = (motion - motion.mean(axis=0)) / np.maximum(motion.std(axis=0), 1e-300)
-    shares, moving = (np.array([np.vdot(p, p) for p in np.array_split(x, DATA.parts)]) for x in (residual, motion))
-    together = np.ones(DATA.together)
+    shares, moving = (np.array([np.vdot(p, p) for p in np.array_split(x, DATA.n_parts)]) for x in (residual, motion))
+    together = np.ones(DATA.burst_parts)
     # noise in proportion to the motion, and cubic distortion
     expected = [np.convolve(moving**k / max((moving**k).sum(), 1e-300), together, "valid") for k in (1, 3)]
     shares = np.convolve(shares / max(shares.sum(), 1e-300), together, "valid")
     first = int(np.argmax(shares))
-    least = max(DATA.share, DATA.times * max(each[first] for each in expected))
-    if shares[first] < least or expected[0].max() > DATA.share:  # after an impact the motion itself is a burst
+    least = max(DATA.min_burst_share, DATA.min_burst_ratio * max(each[first] for each in expected))
+    # after an impact the motion itself is a burst
+    if shares[first] < least or expected[0].max() > DATA.min_burst_share:
         return ()
-    edges = np.array_split(record.time[-len(residual) :], DATA.parts)
-    begins, ends = edges[first][0], edges[first + DATA.together - 1][-1]
+    edges = np.array_split(record.time[-len(residual) :], DATA.n_parts)
+    begins, ends = edges[first][0], edges[first + DATA.burst_parts - 1][-1]
     return (
         f"in record {record.name!r} {100 * shares[first]:.0f} % of the residual energy lies from {begins:.4g} to"
         f" {ends:.4g} s: lost or wrong samples, or an unmeasured impact? It may look like noise of the inputs, or like"
@@ -260,7 +262,7 @@ def steps(record: Record) -> np.ndarray:
     for j, row in enumerate(record.outputs):
         differences = np.diff(np.unique(row))
         step = float(differences.min(initial=np.inf))
-        if np.isfinite(step) and np.abs(differences / step - np.round(differences / step)).max() < DATA.whole:
+        if np.isfinite(step) and np.abs(differences / step - np.round(differences / step)).max() < DATA.step_tolerance:
             result[j] = step
     return result
 
@@ -268,13 +270,13 @@ def steps(record: Record) -> np.ndarray:
 def _dead(record: Record) -> Iterator[DataFault]:
     for name, row in zip(record.output_names, record.outputs, strict=True):
         n_values = np.unique(row[:64]).size
-        if n_values < DATA.fewest_values:  # most signals move within their first samples; the rest is not searched then
+        if n_values < DATA.min_values:  # most signals move within their first samples; the rest is not searched then
             n_values = np.unique(row).size
-        if n_values >= DATA.fewest_values:
+        if n_values >= DATA.min_values:
             if np.abs(row - np.linspace(row[0], row[-1], row.size)).max() < 1e-6 * abs(row[-1] - row[0]):
                 message = f"output {name!r} is a straight line, a clock or a counter; leave it out"
                 yield DataFault("dead", (name,), message)
-        elif row.size >= DATA.fewest_values:
+        elif row.size >= DATA.min_values:
             several = f"takes {n_values} values only, {row.min():g} to {row.max():g}"
             what = several if n_values > 1 else f"stays at {row[0]:g}"
             yield DataFault("dead", (name,), f"output {name!r} {what}: the sensor is dead or too coarse; leave it out")
@@ -283,7 +285,7 @@ def _dead(record: Record) -> Iterator[DataFault]:
 def _copied(record: Record, alive: list[int]) -> Iterator[DataFault]:
     if len(alive) < 2:
         return
-    part = record.outputs[alive, : DATA.longest]
+    part = record.outputs[alive, : DATA.max_compared_samples]
     about = part - part.mean(axis=1, keepdims=True)
     size = np.sqrt((about**2).mean(axis=1))
     # Outputs that are at rest here are not compared.
@@ -291,18 +293,18 @@ def _copied(record: Record, alive: list[int]) -> Iterator[DataFault]:
     scaled = about[moving] / size[moving, None]
     names = [record.output_channels[j].name for j, moves in zip(alive, moving, strict=True) if moves]
     copies: set[int] = set()
-    for first in range(0, len(scaled), DATA.block):
-        alike = scaled[first : first + DATA.block] @ scaled[first:].T / part.shape[1]
+    for first in range(0, len(scaled), DATA.batch_size):
+        alike = scaled[first : first + DATA.batch_size] @ scaled[first:].T / part.shape[1]
         near = np.triu(np.abs(alike) > 1.0 - 1e-6, 1)
         for row in np.flatnonzero(near.any(axis=1)).tolist():
             i, others = first + row, np.flatnonzero(near[row])
             others = others[~np.isin(first + others, list(copies))]
             noise = 0.0 if i in copies or not others.size else _innovation_std(scaled[i])
             # Without noise, sensors of a single mode are the same up to scale.
-            if noise <= DATA.noise_free:
+            if noise <= DATA.noise_free_ratio:
                 continue
             difference = scaled[i] - np.sign(alike[row, others])[:, None] * scaled[first + others]
-            for j in (first + others[np.sqrt((difference**2).mean(axis=1)) < DATA.copied * noise]).tolist():
+            for j in (first + others[np.sqrt((difference**2).mean(axis=1)) < DATA.copy_tolerance * noise]).tolist():
                 copies.add(j)
                 message = (
                     f"outputs {names[i]!r} and {names[j]!r} are the same signal, its noise included, which would count"
@@ -324,7 +326,8 @@ def _clipped(record: Record, alive: list[int]) -> Iterator[DataFault]:
     for j in alive:
         row, name = record.outputs[j], record.output_channels[j].name
         piled = _piled(row)
-        clear = [side for side, at in piled.items() if _piles_up(row, at, DATA.least_piled, DATA.piled)]
+        limits = DATA.min_clipped_samples, DATA.min_clipped_ratio
+        clear = [side for side, at in piled.items() if _piles_up(row, at, *limits)]
         if clear:
             # Where one end of the range is too small, so may be the other: two equal samples are enough there.
             at, last = piled[clear[0]], float(record.time[max(a[-1] for a in piled.values() if a.size > 1)])
@@ -339,7 +342,7 @@ def _piled(row: np.ndarray) -> dict[str, np.ndarray]:
     """Indices of samples at either end of a signal's range, without turning points of sines (equal on both sides)."""
     padded = np.pad(row, 1, constant_values=np.nan)
     before, after = padded[:-2], padded[2:]
-    turns = (np.abs(before - after) <= DATA.turning * np.ptp(row)) & (before != row)
+    turns = (np.abs(before - after) <= DATA.turning_tolerance * np.ptp(row)) & (before != row)
     return {name: np.flatnonzero((row == end) & ~turns) for name, end in (("above", row.max()), ("below", row.min()))}
 
 
@@ -356,7 +359,7 @@ def _has_levels(row: np.ndarray, at: np.ndarray) -> bool:
     """Whether a signal is a sequence of constant levels, the highest of them at `at`: it repeats elsewhere too."""
     outer = row[1:] / row[at[0]] > 0.5
     outer &= row[1:] != row[at[0]]
-    return not outer.any() or float(np.mean(np.diff(row)[outer] == 0)) > DATA.held
+    return not outer.any() or float(np.mean(np.diff(row)[outer] == 0)) > DATA.max_repeated_share
 
 
 def _upsampled(record: Record, alive: list[int]) -> Iterator[DataFault]:
@@ -365,9 +368,9 @@ def _upsampled(record: Record, alive: list[int]) -> Iterator[DataFault]:
         for order, how in ((1, "held"), (2, "joined by straight lines")):
             moves = np.abs(np.diff(row, order))
             changes = np.flatnonzero(moves > 1e-9 * np.abs(row).max())
-            every = int(np.gcd.reduce(np.diff(changes))) if changes.size >= DATA.fewest_changes else 1
+            every = int(np.gcd.reduce(np.diff(changes))) if changes.size >= DATA.min_changes else 1
             # An output that rests for long has changes that are far apart too, but few.
-            if 1 < every <= DATA.slowest and changes.size > 0.5 * (np.ptp(changes) // every):
+            if 1 < every <= DATA.max_hold_samples and changes.size > 0.5 * (np.ptp(changes) // every):
                 message = (
                     f"output {name!r} changes once in {every} samples only: it was sampled at"
                     f" {record.sample_rate_hz / every:g} Hz and {how}, not at {record.sample_rate_hz:g} Hz; leave it"

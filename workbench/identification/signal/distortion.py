@@ -19,11 +19,12 @@ from workbench.structure.modes import frozen
 class PeriodicSettings:
     """Constants of the detection of a period and its lines."""
 
-    excited: float = 0.05  # least amplitude of an excited line, relative to the largest line of the inputs
-    settling: int = 1  # periods at the start that are left out as transient
-    high: float = 0.9  # least autocorrelation of the inputs at a period; that of other lags is far lower
-    low: float = 0.5  # autocorrelation that lags before the period fall below; that of a slow drift does not
-    least: int = 8  # samples of a period, at least
+    min_line_ratio: float = 0.05  # amplitude of an excited line, relative to the largest line of the inputs
+    transient_periods: int = 1  # at the start, that are left out
+    min_autocorrelation: float = 0.9  # of the inputs at a period; that of other lags is far lower
+    # that lags before the period fall below; that of a slow drift does not
+    low_autocorrelation: float = 0.5
+    min_period_samples: int = 8
 
 
 PERIODIC = PeriodicSettings()
@@ -75,12 +76,12 @@ def distortion_of(record: Record) -> Distortion:
     period = period_of(record.inputs)
     if period is None:
         raise ValueError(f"record {record.name!r}: its inputs do not repeat, so no line is free of them")
-    n_periods = record.n_samples // period - PERIODIC.settling
+    n_periods = record.n_samples // period - PERIODIC.transient_periods
     if n_periods < 2:
         raise ValueError(
-            f"record {record.name!r} has {n_periods + PERIODIC.settling} periods; noise needs three or more"
+            f"record {record.name!r} has {n_periods + PERIODIC.transient_periods} periods; noise needs three or more"
         )
-    whole = slice(PERIODIC.settling * period, (PERIODIC.settling + n_periods) * period)
+    whole = slice(PERIODIC.transient_periods * period, (PERIODIC.transient_periods + n_periods) * period)
 
     def lines_of(signals: np.ndarray) -> np.ndarray:
         """Fourier lines (n_signals, n_periods, n_lines) complex, their moduli rms."""
@@ -94,7 +95,7 @@ def distortion_of(record: Record) -> Distortion:
     return Distortion(
         name=record.name,
         frequencies_hz=frozen(np.arange(1, size.size + 1) / (period * record.sample_time)),
-        excited=frozen(size > PERIODIC.excited * size.max(), bool),
+        excited=frozen(size > PERIODIC.min_line_ratio * size.max(), bool),
         amplitudes=frozen(np.abs(mean)),
         noise=frozen(np.sqrt(scatter / n_periods)),
         channels=record.output_channels,
@@ -117,7 +118,7 @@ def period_of(inputs: np.ndarray) -> int | None:
     """
     n = np.shape(inputs)[1]
     most = n // 2
-    if most < 2 * PERIODIC.least:
+    if most < 2 * PERIODIC.min_period_samples:
         return None
     u = np.asarray(inputs, float)
     u = (u - u.mean(axis=1, keepdims=True))[np.ptp(u, axis=1) > 0]
@@ -129,10 +130,10 @@ def period_of(inputs: np.ndarray) -> int | None:
     lags = np.arange(most + 2)
     scale = np.sqrt(sums[n - lags] * (sums[n] - sums[lags]))
     autocorrelation = product / np.where(scale > 0, scale, np.inf)
-    low = np.flatnonzero(autocorrelation[:most] < PERIODIC.low)
+    low = np.flatnonzero(autocorrelation[:most] < PERIODIC.low_autocorrelation)
     if low.size == 0:
         return None
-    start = max(int(low[0]), PERIODIC.least)
+    start = max(int(low[0]), PERIODIC.min_period_samples)
     before, at, after = (autocorrelation[start + shift : most + 1 + shift] for shift in (-1, 0, 1))
-    peaks = start + np.flatnonzero((at > PERIODIC.high) & (at >= before) & (at >= after))
+    peaks = start + np.flatnonzero((at > PERIODIC.min_autocorrelation) & (at >= before) & (at >= after))
     return int(peaks[0]) if peaks.size else None

@@ -17,14 +17,16 @@ from workbench.structure.printed import joined_in_words
 class SpectraSettings:
     """Constants of averaged spectra of several inputs."""
 
-    segment_samples: int = 4096  # at most
-    segments: int = 4  # without overlap, for each input: S_uu of fewer averages than inputs has no inverse
-    fewest_samples: int = 16  # of a segment
-    in_memory: int = 64  # segments at once
-    alike: float = 0.95  # coherence of an input with the others above which it varies H more than 20-fold, 1 / (1 - γ²)
-    silent: float = 1e-12  # power of an input over its largest, below which a line is not excited
-    excited: float = 1e-4  # power of an input over its largest, above which a line tells whether inputs are alike
-    coherent: float = 0.5  # least coherence of any output at a line that the inputs excite less
+    max_segment_samples: int = 4096
+    segments_per_input: int = 4  # without overlap: S_uu of fewer averages than inputs has no inverse
+    min_segment_samples: int = 16
+    batch_size: int = 64  # segments at once
+    # of an input with the others, above which it varies H more than 20-fold, 1 / (1 - γ²)
+    max_input_coherence: float = 0.95
+    silent_power_ratio: float = 1e-12  # of an input to its largest, below which a line is not excited
+    # of an input to its largest, above which a line tells whether inputs are alike
+    excited_power_ratio: float = 1e-4
+    min_output_coherence: float = 0.5  # of any output at a line that the inputs excite less
 
 
 SPECTRA = SpectraSettings()
@@ -61,27 +63,27 @@ def frequency_responses(records: Sequence[Record]) -> FrfEstimate:
         raise ValueError("every input is constant")
     names = tuple(first.input_names[i] for i in active)
     n, samples = len(active), [record.n_samples for record in records]
-    segment = min(SPECTRA.segment_samples, sum(samples) // (SPECTRA.segments * n), min(samples))
-    if segment < SPECTRA.fewest_samples:
-        least = SPECTRA.segments * SPECTRA.fewest_samples * n
+    segment = min(SPECTRA.max_segment_samples, sum(samples) // (SPECTRA.segments_per_input * n), min(samples))
+    if segment < SPECTRA.min_segment_samples:
+        least = SPECTRA.segments_per_input * SPECTRA.min_segment_samples * n
         raise ValueError(f"{sum(samples)} samples are too few to average spectra of {n} inputs: {least} are needed")
     spectra, averages = _averaged(records, active, segment)
     lines = np.fft.rfftfreq(segment, first.sample_time)[1:]
     of_inputs, across = spectra[:n, :n].transpose(2, 0, 1), spectra[n:, :n].transpose(2, 0, 1)
     powers = of_inputs.diagonal(axis1=1, axis2=2).real  # (n_lines, n_inputs)
-    nonzero = (powers > SPECTRA.silent * powers.max(axis=0)).all(axis=1)
+    nonzero = (powers > SPECTRA.silent_power_ratio * powers.max(axis=0)).all(axis=1)
     scales = np.sqrt(np.where(powers > 0.0, powers, 1.0))
     alike = of_inputs / (scales[:, :, None] * scales[:, None])
     inverse = np.linalg.inv(np.where(nonzero[:, None, None], alike, 0.0) + 1e-12 * np.eye(n))
     with_others: Floats = np.asarray(1.0 - 1.0 / inverse.diagonal(axis1=1, axis2=2).real, np.float64)
-    distinct = nonzero & (with_others < SPECTRA.alike).all(axis=1)
-    excited = nonzero & (powers > SPECTRA.excited * powers.max(axis=0)).all(axis=1)
+    distinct = nonzero & (with_others < SPECTRA.max_input_coherence).all(axis=1)
+    excited = nonzero & (powers > SPECTRA.excited_power_ratio * powers.max(axis=0)).all(axis=1)
     _check_apart(names, alike, with_others, excited)
     scaled = (across / scales[:, None]) @ inverse
     outputs = spectra[n:, n:].diagonal().real  # (n_lines, n_outputs)
     explained = np.einsum("fji,fji->fj", scaled, (across / scales[:, None]).conj()).real
     coherence = np.divide(explained, outputs, out=np.full_like(explained, np.nan), where=outputs > 0.0)
-    distinct &= excited | (coherence > SPECTRA.coherent).any(axis=1)
+    distinct &= excited | (coherence > SPECTRA.min_output_coherence).any(axis=1)
     values = np.where(distinct[:, None, None], scaled / scales[:, None], np.nan)
     found = FrequencyResponses(values.transpose(1, 2, 0), lines, first.output_channels, names, name=first.name)
     coherence = np.where(distinct[:, None], np.clip(coherence, 0.0, 1.0), np.nan).T
@@ -98,8 +100,8 @@ def _averaged(records: Sequence[Record], active: Sequence[int], segment: int) ->
     for record in records:
         signals = np.vstack([record.inputs[active], record.outputs])
         parts = np.lib.stride_tricks.sliding_window_view(signals, segment, axis=1)[:, ::step]
-        for at in range(0, parts.shape[1], SPECTRA.in_memory):
-            some = parts[:, at : at + SPECTRA.in_memory]
+        for at in range(0, parts.shape[1], SPECTRA.batch_size):
+            some = parts[:, at : at + SPECTRA.batch_size]
             each = rfft((some - some.mean(axis=2, keepdims=True)) * window)[..., 1:]
             total += np.einsum("ikf,jkf->ijf", each, each.conj(), optimize=True)
             count += each.shape[1]
@@ -110,11 +112,11 @@ def _check_apart(names: Sequence[str], alike: np.ndarray, with_others: Floats, e
     """Raise where, at half of the lines that all inputs excite, an input follows from the others."""
     if not excited.any():
         raise ValueError(f"no frequency is excited by all of the inputs {joined_in_words(names)}")
-    if np.median(with_others[excited].max(axis=1)) < SPECTRA.alike:
+    if np.median(with_others[excited].max(axis=1)) < SPECTRA.max_input_coherence:
         return
     pairs = np.median(np.abs(alike[excited]) ** 2, axis=0)
     i, j = divmod(int(np.argmax(pairs - 2.0 * np.eye(len(names)))), len(names))
-    if pairs[i, j] >= SPECTRA.alike:
+    if pairs[i, j] >= SPECTRA.max_input_coherence:
         raise ValueError(
             f"the inputs {names[i]} and {names[j]} are correlated, with a coherence of {pairs[i, j]:.3f} between them;"
             " independent inputs are needed to distinguish the responses"

@@ -23,17 +23,18 @@ from workbench.structure.printed import mode_text
 class HarmonicSettings:
     """Constants of the tests for harmonic excitation and for overtones."""
 
-    # Largest ratio of the mean of |z|⁴ to the square of the mean of |z|² for a sine. In random motion over six decay
-    # times of a mode one in a thousand is below 1.42; a sine with a tenth of its power in random motion has 1.17.
-    steady: float = 1.3
-    lines: int = 8  # least number of lines on either side that form the envelope
+    # Ratio of the mean of |z|⁴ to the square of the mean of |z|² for a sine. In random motion over six decay times of a
+    # mode one in a thousand is below 1.42; a sine with a tenth of its power in random motion has 1.17.
+    max_kurtosis: float = 1.3
+    min_lines: int = 8  # on either side, that form the envelope
     false_alarm: float = 1e-4  # probability that a line of random motion is taken for a sine
-    peaked: float = 5.0  # power at the peak of a mode over its median within two bandwidths: 1 + 2²
-    highest: int = 9  # order of an overtone
-    at_most: float = 0.03  # largest amplitude of an overtone, relative to its base
-    within: float = 2e-3  # relative tolerance of its frequency
-    scatters: float = 2.0  # further tolerance of its frequency, in rms scatters of the base's frequency times the order
-    damping: float = 0.2  # relative tolerance of its decay rate
+    mode_peak_ratio: float = 5.0  # power at the peak of a mode over its median within two bandwidths: 1 + 2²
+    max_overtone_order: int = 9
+    max_amplitude: float = 0.03  # of an overtone, relative to its base
+    frequency_tolerance: float = 2e-3  # relative
+    # further tolerance of the frequency, in rms scatters of the base's frequency times the order
+    scatter_tolerance: float = 2.0
+    decay_tolerance: float = 0.2  # relative, of the decay rate
 
 
 HARMONICS = HarmonicSettings()
@@ -76,18 +77,18 @@ def _is_steady(lines: Complexes, power: Floats, pole: complex) -> bool:
         lines: (n_outputs, n_lines) Fourier transform of the outputs.
         power: (n_outputs,) sum of squares of the outputs.
     """
-    half = max(2.0 * abs(pole.real), HARMONICS.lines)
+    half = max(2.0 * abs(pole.real), HARMONICS.min_lines)
     first, last = (round(pole.imag + side * half) for side in (-1.0, 1.0))
     if first < 1 or last >= lines.shape[1]:
         return False
     inside = lines[:, first : last + 1]
     strongest = inside[np.argmax((np.abs(inside) ** 2).sum(axis=1) / power)]
     line_power = np.abs(inside) ** 2
-    ratio = HARMONICS.peaked * np.log(line_power.size / HARMONICS.false_alarm) / np.log(2.0)
-    if abs(pole.real) >= HARMONICS.lines and (line_power.max(axis=1) > ratio * np.median(line_power, axis=1)).any():
+    ratio = HARMONICS.mode_peak_ratio * np.log(line_power.size / HARMONICS.false_alarm) / np.log(2.0)
+    if abs(pole.real) >= HARMONICS.min_lines and (line_power.max(axis=1) > ratio * np.median(line_power, axis=1)).any():
         return True
     envelope = np.abs(np.fft.ifft(strongest, 4 * strongest.size)) ** 2
-    return bool((envelope**2).mean() < HARMONICS.steady * envelope.mean() ** 2)
+    return bool((envelope**2).mean() < HARMONICS.max_kurtosis * envelope.mean() ** 2)
 
 
 def near_mains(frequency_hz: float) -> bool:
@@ -103,8 +104,8 @@ def multiple_of(frequencies: Floats, size: Floats, r: int) -> tuple[int | None, 
     """
     for base in np.argsort(-size):
         times = round(frequencies[r] / frequencies[base])
-        near = abs(frequencies[r] / frequencies[base] - times) < HARMONICS.within * times
-        if 2 <= times <= HARMONICS.highest and near and size[r] < HARMONICS.at_most * size[base]:
+        near = abs(frequencies[r] / frequencies[base] - times) < HARMONICS.frequency_tolerance * times
+        if 2 <= times <= HARMONICS.max_overtone_order and near and size[r] < HARMONICS.max_amplitude * size[base]:
             return int(base), times
     return None, 0
 
@@ -123,7 +124,7 @@ def overtone_remarks(poles: np.ndarray, size: Floats, scatter: Floats, deviation
     """
     overtones, base_modes = [], set()
     for r in range(poles.size):
-        bases = [base for base in np.flatnonzero(scatter).tolist() if size[r] < HARMONICS.at_most * size[base]]
+        bases = [base for base in np.flatnonzero(scatter).tolist() if size[r] < HARMONICS.max_amplitude * size[base]]
         for base in sorted(bases, key=lambda k: -size[k]):
             sums = _sums(poles, size, base, r)
             words = next((w for w, pole, n in sums if _agrees(poles[r], pole, n * scatter[base], deviation[r])), None)
@@ -149,7 +150,7 @@ def _sums(poles: np.ndarray, size: Floats, base: int, r: int) -> Iterator[tuple[
     own = complex(poles[base])
     for times in (2, 3):
         yield f"{times} × mode {base + 1}", times * own, times
-    for other in np.setdiff1d(np.flatnonzero(HARMONICS.at_most * size > size[r]), base):
+    for other in np.setdiff1d(np.flatnonzero(HARMONICS.max_amplitude * size > size[r]), base):
         for times, of_base in ((1, f"mode {base + 1}"), (2, f"2 × mode {base + 1}")):
             for sign, word in ((1.0, "plus"), (-1.0, "less")):
                 frequency = abs(poles[other].imag + sign * times * own.imag)
@@ -159,6 +160,7 @@ def _sums(poles: np.ndarray, size: Floats, base: int, r: int) -> Iterator[tuple[
 
 def _agrees(pole: complex, overtone: complex, scatter: float, deviation: complex) -> bool:
     """Whether a pole agrees with that of an overtone in frequency and in decay rate."""
-    frequency = HARMONICS.within * overtone.imag + HARMONICS.scatters * scatter + SURE * deviation.imag
-    decay = HARMONICS.damping * abs(overtone.real) + SURE * deviation.real
+    frequency = HARMONICS.frequency_tolerance * overtone.imag + HARMONICS.scatter_tolerance * scatter
+    frequency += SURE * deviation.imag
+    decay = HARMONICS.decay_tolerance * abs(overtone.real) + SURE * deviation.real
     return abs(pole.imag - overtone.imag) < frequency and abs(pole.real - overtone.real) < decay

@@ -37,26 +37,27 @@ from workbench.records.record import Record
 class ProjectionSettings:
     """Constants of projections and of the statistics of their noise."""
 
-    largest_factored: int = 300_000  # n_samples × n_modes up to which Φ is factored, block by block
-    longest_factored: int = 20_000  # samples, likewise; above, normal equations take less time
-    many: int = 1_000_000  # samples of a transform above which its cached tables are dropped
-    part: int = 8192  # samples of a part of a long record, a multiple of the block
-    block: int = 256  # samples of a block
-    decayed: float = 41.0  # nepers after which an exponential is left out: e^-41 is below the last digit of 1
-    summed: float = 1e-14  # relative round-off of a sum of squares that is a difference of sums over the record
-    split: float = 0.05  # probability that records of equal noise are given separate variances, which costs little
+    max_factored: int = 300_000  # n_samples × n_modes up to which Φ is factored, block by block
+    max_factored_samples: int = 20_000  # likewise; above, normal equations take less time
+    max_cached_samples: int = 1_000_000  # of a transform, above which its cached tables are dropped
+    part_samples: int = 8192  # of a part of a long record, a multiple of the block
+    block_samples: int = 256
+    max_nepers: float = 41.0  # after which an exponential is left out: e^-41 is below the last digit of 1
+    sum_round_off: float = 1e-14  # relative, of a sum of squares that is a difference of sums over the record
+    # that records of equal noise are given separate variances, which costs little
+    split_probability: float = 0.05
     false_alarm: float = 1e-3  # probability that white noise is taken for coloured
-    least_bins: int = 6  # least half width of the average of a spectrum
-    own: float = 1e-3  # least share of an output's noise that is uncorrelated with that of all others
-    band: int = 32  # lines of a band in which the correlation of noise is estimated
-    harmless: float = 1.2  # largest eigenvalue of the correlation matrix up to which correlation is neglected
-    at_once: int = 2**21  # products of outputs, in all bands, that are held in memory at once: 16 MB
+    min_half_bins: int = 6  # half width of the average of a spectrum
+    min_independent_share: float = 1e-3  # of an output's noise, uncorrelated with that of all others
+    band_lines: int = 32  # in which the correlation of noise is estimated
+    max_eigenvalue: float = 1.2  # of the correlation matrix, up to which correlation is neglected
+    max_products: int = 2**21  # of outputs, in all bands, that are held in memory at once: 16 MB
     median_efficiency: float = 0.25  # of the median over windowed bands, relative to the mean without a window
-    order: int = 12  # of the autoregressive model of coloured noise
-    samples_each: int = 40  # per coefficient of that model, and per output for a correlation matrix, at least
-    rounding: float = 1e-9  # relative residual of records without noise
-    spectra_alike: float = 0.1  # rms of log ratios below which two spectra are the same
-    most_taken: float = 0.9  # largest leverage of a line that is used for the noise spectrum
+    max_ar_order: int = 12  # of the autoregressive model of coloured noise
+    samples_per_parameter: int = 40  # of that model, and per output for a correlation matrix, at least
+    noise_free_ratio: float = 1e-9  # relative residual of records without noise
+    spectrum_tolerance: float = 0.1  # rms of log ratios below which two spectra are the same
+    max_leverage: float = 0.9  # of a line that is used for the noise spectrum
 
 
 PROJECTION = ProjectionSettings()
@@ -113,7 +114,7 @@ def project(record: Record, poles: np.ndarray, offset: bool) -> Projection:
         numpy.linalg.LinAlgError: exponentials that cannot be distinguished.
     """
     n = record.n_samples
-    if n > PROJECTION.longest_factored or n * poles.size > PROJECTION.largest_factored:
+    if n > PROJECTION.max_factored_samples or n * poles.size > PROJECTION.max_factored:
         return _project_by_parts(record, poles, offset)
     rows = _Rows(record, poles)
     columns = np.hstack([rows.phi, rows.level[:, None]]) if offset else rows.phi
@@ -233,7 +234,7 @@ def _project_by_parts(record: Record, poles: np.ndarray, offset: bool) -> Projec
     gram, spread = doubly - tilted.T @ tilt, solve(np.eye(len(whole)))
     if (np.diag(gram) < 0.0).any():  # sums of squares that are round-off only
         raise np.linalg.LinAlgError("exponentials that are alike to round-off")
-    return Projection(record, poles, squares, PROJECTION.summed, coefficients, gram, slopes, spread, tilt)
+    return Projection(record, poles, squares, PROJECTION.sum_round_off, coefficients, gram, slopes, spread, tilt)
 
 
 class _Exponentials:
@@ -248,20 +249,20 @@ class _Exponentials:
         # Sorted by decay rate, the exponentials that remain in a part are the first few.
         self.order = np.argsort(-poles.real)
         self.sorted_poles = poles[self.order]
-        self.lifetimes = PROJECTION.decayed / np.maximum(-self.sorted_poles.real, 1e-300)
-        self.tau = self.dt * np.arange(PROJECTION.block)
+        self.lifetimes = PROJECTION.max_nepers / np.maximum(-self.sorted_poles.real, 1e-300)
+        self.tau = self.dt * np.arange(PROJECTION.block_samples)
         self.near = np.exp(np.outer(self.tau, self.sorted_poles))
 
     def _parts(self) -> Iterator[tuple[slice, Floats, Complexes]]:
         """Parts of the record: samples, start times T of their blocks, s, and e^{λT} of the exponentials that have not
         decayed, (n_blocks, n_left)."""
         n = self.record.n_samples
-        for first in range(0, n, PROJECTION.part):
-            part = slice(first, min(first + PROJECTION.part, n))
+        for first in range(0, n, PROJECTION.part_samples):
+            part = slice(first, min(first + PROJECTION.part_samples, n))
             n_left = int(np.searchsorted(-self.lifetimes, -first * self.dt, side="right"))
             if not n_left:
                 return
-            begin: Floats = self.dt * np.arange(first, part.stop, PROJECTION.block, dtype=float)
+            begin: Floats = self.dt * np.arange(first, part.stop, PROJECTION.block_samples, dtype=float)
             yield part, begin, np.exp(np.outer(begin, self.sorted_poles[:n_left]))
 
     def sums(self) -> tuple[Floats, Floats]:
@@ -298,10 +299,10 @@ def whitened(records: Sequence[Record], poles: np.ndarray) -> list[Record] | Non
     for modes. Outputs are therefore first replaced by combinations of uncorrelated noise, each with its own filter.
     """
     residuals = [project(record, poles, True).residual.T for record in records]
-    order = min(PROJECTION.order, sum(each.shape[1] for each in residuals) // PROJECTION.samples_each)
+    order = min(PROJECTION.max_ar_order, sum(each.shape[1] for each in residuals) // PROJECTION.samples_per_parameter)
     squares = sum((each**2).sum(axis=1) for each in residuals)
     energy = sum((record.outputs**2).sum(axis=1) for record in records)
-    if order == 0 or (squares < PROJECTION.rounding**2 * energy).any():
+    if order == 0 or (squares < PROJECTION.noise_free_ratio**2 * energy).any():
         return None
     uncorrelated = independent(records, residuals)
     if uncorrelated is not None:
@@ -352,25 +353,26 @@ def correlation_of_lines(lines: Sequence[np.ndarray]) -> Floats | None:
     m (m - 1)/2 degrees of freedom.
     """
     m, size = len(lines[0]), 2 * sum(each.shape[1] for each in lines)
-    if m == 1 or min(each.shape[1] for each in lines) < PROJECTION.band or size < PROJECTION.samples_each * m:
+    n_lines = min(each.shape[1] for each in lines)
+    if m == 1 or n_lines < PROJECTION.band_lines or size < PROJECTION.samples_per_parameter * m:
         return None
     values, vectors = np.linalg.eigh(_median_correlation(lines))
-    matrix: Floats = (vectors * np.maximum(values, PROJECTION.own)) @ vectors.T
+    matrix: Floats = (vectors * np.maximum(values, PROJECTION.min_independent_share)) @ vectors.T
     matrix /= np.sqrt(np.outer(np.diag(matrix), np.diag(matrix)))
     statistic = -(PROJECTION.median_efficiency * size - (2 * m + 5) / 6.0) * np.linalg.slogdet(matrix)[1]
-    none = statistic < chi2.isf(PROJECTION.false_alarm, m * (m - 1) // 2) or values[-1] < PROJECTION.harmless
+    none = statistic < chi2.isf(PROJECTION.false_alarm, m * (m - 1) // 2) or values[-1] < PROJECTION.max_eigenvalue
     return None if none else matrix
 
 
 def _median_correlation(lines: Sequence[np.ndarray]) -> Floats:
     """Median over bands of the correlation of lines (n_outputs, n_lines) of each record; its lower triangle only."""
-    m, band = len(lines[0]), 2 * PROJECTION.band
+    m, band = len(lines[0]), 2 * PROJECTION.band_lines
     # Real and imaginary parts alternate: the real part of a product with a conjugate is their scalar product.
     bands = [np.ascontiguousarray(each).view(float) for each in lines]
     bands = [each[:, : each.shape[1] // band * band].reshape(m, -1, band).transpose(1, 0, 2) for each in bands]
     norms = [np.sqrt(np.einsum("bjk,bjk->bj", each, each)) + 1e-150 for each in bands]
     median, n_bands = np.zeros((m, m)), sum(map(len, bands))
-    some = max(PROJECTION.at_once // (n_bands * m), 1)  # so many rows of the matrix at a time
+    some = max(PROJECTION.max_products // (n_bands * m), 1)  # so many rows of the matrix at a time
     for start in range(0, m, some):
         rows, columns = slice(start, min(start + some, m)), slice(0, min(start + some, m))
         each = zip(bands, norms, strict=True)
@@ -422,7 +424,7 @@ def noise_near(poles: np.ndarray, residual: np.ndarray, noise: np.ndarray, sampl
     """
     n, m = residual.shape
     bin_width = 2.0 * np.pi / (n * sample_time)
-    widths = np.maximum(np.abs(poles.real), PROJECTION.least_bins * bin_width)
+    widths = np.maximum(np.abs(poles.real), PROJECTION.min_half_bins * bin_width)
     # The fit of a mode removes the noise of one bin.
     taken = _bandwidth_weight(np.subtract.outer(poles.imag, poles.imag) / widths).sum(axis=0)
     factors = np.ones((m, poles.size))
@@ -460,7 +462,7 @@ def forget_transforms(n: int) -> None:
 
     It keeps the tables of the last sixteen lengths, each as large as its signal; short transforms replace them.
     """
-    if n > PROJECTION.many:
+    if n > PROJECTION.max_cached_samples:
         for size in range(1, 17):
             for kind in (np.float32, np.float64):
                 rfft(np.ones(size, kind))
@@ -477,7 +479,7 @@ def noise_along(signals: np.ndarray, residual: np.ndarray, n_modes: int) -> np.n
     total = weight.sum(axis=0)
     ratio = (weight / np.where(total > 0, total, 1.0)).T @ power
     # A constant is disturbed by noise about zero frequency.
-    ratio[total <= 1e-20 * len(signals)] = power[: 2 * PROJECTION.least_bins].mean(axis=0)
+    ratio[total <= 1e-20 * len(signals)] = power[: 2 * PROJECTION.min_half_bins].mean(axis=0)
     return np.where(white(power, n_modes), 1.0, ratio)
 
 
@@ -521,7 +523,7 @@ def differ(squares: np.ndarray, free: np.ndarray) -> np.ndarray:
     total = free.sum(axis=0)
     statistic = total * np.log(squares.sum(axis=0) / total) - (free * np.log(squares / free)).sum(axis=0)
     corrected = statistic / (1.0 + ((1.0 / free).sum(axis=0) - 1.0 / total) / (3.0 * (n - 1)))
-    return np.asarray(corrected > chi2.isf(PROJECTION.split, n - 1))
+    return np.asarray(corrected > chi2.isf(PROJECTION.split_probability, n - 1))
 
 
 def _per_output(free: np.ndarray, squares: np.ndarray) -> np.ndarray:

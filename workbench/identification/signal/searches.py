@@ -37,14 +37,14 @@ FALSE_ALARM = 1e-3  # probability that a record of noise alone yields a mode
 class FitSettings:
     """Constants of every fit of modes."""
 
-    most_steps: int = 60
+    max_steps: int = 60
     # predicted decrease of χ² per value; the step then moves the estimate by under a thousandth of its standard error
-    negligible: float = 1e-6
+    cost_tolerance: float = 1e-6
     round_off: float = 1e-26  # of a sum of squares, relative to that of the measurement
-    most_growth: float = 20.0  # nepers over a record; poles that grow faster are inadmissible
-    fastest_decay: float = 1.0  # nepers per sample; poles that decay faster are inadmissible
-    # largest ratio of a participation factor to the one normalised to 1; diverging factors are no mode's, and overflow
-    most_unlike: float = 1e20
+    max_growth: float = 20.0  # nepers over a record; poles that grow faster are inadmissible
+    max_decay: float = 1.0  # nepers per sample; poles that decay faster are inadmissible
+    # of a participation factor to the one normalised to 1; diverging factors are no mode's, and overflow
+    max_participation_ratio: float = 1e20
 
 
 @dataclass(frozen=True)
@@ -53,23 +53,23 @@ class SelectionSettings:
 
     search_share: float = 0.5  # of the time, for the selection of modes; the rest is for refinement and errors
     forward_share: float = 0.6  # of the time left, for one forward search; the rest is to test the new modes
-    most_damped: float = 0.3  # damping ratio above which a pole is no mode
-    most_growth: float = 0.5  # nepers over a record above which a pole grows: it may be coloured noise
-    same_shape: float = 0.95  # MAC from which on two overlapping poles are one mode, split
-    most_rounds: int = 4  # in coloured noise, or with amplitude dependence, modes might enter and leave for ever
-    few_steps: int = 12  # of a fit that only decides whether a mode enters or leaves
-    decided: float = 0.1  # decrease of χ², expected of a further step per value, below which such a fit ends
-    weak: float = 4.0  # times the threshold, below which a mode may be noise and is tested again
-    close: float = 2.0  # bandwidths to the next mode, likewise
+    max_damping: float = 0.3  # ratio above which a pole is no mode
+    max_growth: float = 0.5  # nepers over a record above which a pole grows: it may be coloured noise
+    min_split_mac: float = 0.95  # from which on two overlapping poles are one mode, split
+    max_rounds: int = 4  # in coloured noise, or with amplitude dependence, modes might enter and leave for ever
+    trial_steps: int = 12  # of a fit that only decides whether a mode enters or leaves
+    trial_tolerance: float = 0.1  # decrease of χ², expected of a further step per value, below which such a fit ends
+    weak_ratio: float = 4.0  # to the threshold, below which a mode may be noise and is tested again
+    close_bandwidths: float = 2.0  # to the next mode, likewise
     noise_bins: int = 50  # on either side of a pole, from which the noise about it is estimated
-    peaks_a_rate: int = 12  # candidates per decay rate, in records with known inputs
+    peaks_per_rate: int = 12  # candidates per decay rate, in records with known inputs
 
 
 FIT = FitSettings()
 SELECTION = SelectionSettings()
 # Probability (1 - MAC)^(n_signals - 1) that random shapes of three signals agree so far; shapes of fewer signals must
 # have a higher MAC to be as improbable.
-BY_CHANCE = (1.0 - SELECTION.same_shape) ** 2
+BY_CHANCE = (1.0 - SELECTION.min_split_mac) ** 2
 
 # (the search under way, the share of the time that is spent)
 Progress = Callable[[str, float], None]
@@ -138,13 +138,13 @@ class DampingSettings:
     The minimum does not depend on these numbers, only the number of steps does; they follow Marquardt.
     """
 
-    first: float = 1e-3
-    raised: float = 8.0  # factor after a step that raised the cost
-    lowered: float = 0.1  # factor after a step that lowered it
-    least: float = 1e-12
-    most: float = 1e8  # above it no step is tried: s has shrunk to a gradient step of 1e-8 standard errors
-    stuck: float = 1e6  # above it the search ends after a step
-    indefinite: float = 1e-9  # least where N is not positive definite
+    initial: float = 1e-3
+    raising_factor: float = 8.0  # after a step that raised the cost
+    lowering_factor: float = 0.1  # after a step that lowered it
+    minimum: float = 1e-12
+    maximum: float = 1e8  # above it no step is tried: s has shrunk to a gradient step of 1e-8 standard errors
+    stop_above: float = 1e6  # the search ends after a step
+    indefinite_minimum: float = 1e-9  # where N is not positive definite
 
 
 DAMPING = DampingSettings()
@@ -197,7 +197,7 @@ def minimise(
         round_off: of the cost; a step that raises it by no more is accepted.
         is_vain: whether a state ends the search, since what follows from it is of no use.
     """
-    state, cost, damping, small = start, problem.cost(start), DAMPING.first, False
+    state, cost, damping, small = start, problem.cost(start), DAMPING.initial, False
     for taken in range(1, most_steps + 1):
         normal, right = problem.normal_equations(state)
         scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
@@ -206,19 +206,19 @@ def minimise(
             try:
                 step = scale * cho_solve(cho_factor(scaled + damping * identity), scale * right)
             except np.linalg.LinAlgError:
-                damping = max(DAMPING.raised * damping, DAMPING.indefinite)
+                damping = max(DAMPING.raising_factor * damping, DAMPING.indefinite_minimum)
                 continue
             trial, step = problem.moved(state, step)
             small = problem.negligible(float(step @ right), cost)
             new_cost = np.inf if trial is None else problem.cost(trial)
             accepted = trial is not None and new_cost <= cost + round_off
-            if accepted or small or damping > DAMPING.most:
+            if accepted or small or damping > DAMPING.maximum:
                 break
-            damping *= DAMPING.raised
+            damping *= DAMPING.raising_factor
         if accepted and trial is not None:
             state, cost = trial, new_cost
-        damping = max(DAMPING.lowered * damping, DAMPING.least)
-        if small or damping > DAMPING.stuck:
+        damping = max(DAMPING.lowering_factor * damping, DAMPING.minimum)
+        if small or damping > DAMPING.stop_above:
             return Minimum(state, cost, small, taken)
         if is_vain(state) or (time_limit is not None and time_limit.spent("refinement")):
             return Minimum(state, cost, False, taken)
@@ -313,7 +313,7 @@ class OrderSelection(Generic[Model, Candidate]):
 
     def select(self, model: Model) -> Model:
         """The model after forward and backward selection, starting from `model`."""
-        for _ in range(SELECTION.most_rounds):
+        for _ in range(SELECTION.max_rounds):
             before = self.problem.n_modes(model)
             grown = self.forward(model)
             most = self.problem.n_modes(grown)
@@ -390,7 +390,7 @@ class OrderSelection(Generic[Model, Candidate]):
 
 def overdamped(poles: np.ndarray) -> np.ndarray:
     """Which poles are damped too much to oscillate."""
-    return np.asarray(-poles.real > SELECTION.most_damped * np.abs(poles))
+    return np.asarray(-poles.real > SELECTION.max_damping * np.abs(poles))
 
 
 def spurious_modes(
@@ -412,7 +412,7 @@ def spurious_modes(
     damped = overdamped(poles)  # no mode splits off such a pole, whose band is wide enough for any
     # A single signal shows no shape, and a mode that depends on amplitude looks like two there.
     others = len(shapes) - 1
-    least_mac = max(SELECTION.same_shape, 1.0 - BY_CHANCE ** (1.0 / others)) if others else SELECTION.same_shape
+    least_mac = max(SELECTION.min_split_mac, 1.0 - BY_CHANCE ** (1.0 / others)) if others else SELECTION.min_split_mac
     split = near & (mac(shapes, shapes) > least_mac) & (strength[:, None] < strength) & ~damped
     if distinct is not None and others == 0:
         for r, s in np.argwhere(split):

@@ -45,19 +45,20 @@ from workbench.threads import one_blas_thread
 class LossSettings:
     """Constants of the search for a local loss."""
 
-    places: int = 60  # along the structure, at which losses are tried
+    trial_places: int = 60  # along the structure, at which losses are tried
     typical_width: float = 0.1  # of the length: its inverse is the number of independent places that are tested
-    widths: tuple[float, ...] = (0.05, 0.1, 0.2, 0.4)  # of the length: a search converges from half to twice the width
-    most_starts: int = 2  # of each width
-    most_looks: int = 4  # searches along the structure after the first, at most
+    # of the length: a search converges from half to twice the width
+    trial_widths: tuple[float, ...] = (0.05, 0.1, 0.2, 0.4)
+    starts_per_width: int = 2  # at most
+    max_further_searches: int = 4  # along the structure after the first
     first_terms: int = 3  # of mass and stiffness in the first search, at most
-    fewer_terms: int = 2  # by which terms are reduced in the next search: many terms imitate a loss well
+    term_reduction: int = 2  # in the next search: many terms imitate a loss well
     draws: int = 20_000  # Monte Carlo samples of a loss, for intervals
     # χ² / degrees of freedom up to which standard errors may be too small, here twofold, and a loss is detected; true
     # losses of the study leave 1.8 at most, a mass of 1 % of the whole that the nominal structure lacks 40
-    errors_wrong: float = 4.0
+    max_misfit_ratio: float = 4.0
     mass_places: int = 40  # along the structure, at which point masses are tried
-    first_mass: float = 1e-3  # of the whole mass: step by which the effect of a point mass is computed
+    mass_step: float = 1e-3  # of the whole mass, by which the effect of a point mass is computed
 
 
 LOSS = LossSettings()
@@ -103,7 +104,7 @@ class LocatedDamage(Printed):
     @staticmethod
     def _explains_roughly(fit: FittedStructure) -> bool:
         """Whether a structure explains the modes, or would with standard errors up to twice as large."""
-        return fit.explains or fit.chi2 <= LOSS.errors_wrong * fit.degrees_of_freedom
+        return fit.explains or fit.chi2 <= LOSS.max_misfit_ratio * fit.degrees_of_freedom
 
     @property
     def loss(self) -> LocalLoss | None:
@@ -158,8 +159,8 @@ def locate_damage(
     nominal: Bar | Beam,
     *,
     basis: Callable[[int], Basis] | None = None,
-    mass_terms: Iterable[int] = range(1, STRUCTURE.most_terms + 1),
-    stiffness_terms: Iterable[int] = range(1, STRUCTURE.most_terms + 1),
+    mass_terms: Iterable[int] = range(1, STRUCTURE.max_terms + 1),
+    stiffness_terms: Iterable[int] = range(1, STRUCTURE.max_terms + 1),
     false_alarm: float = FALSE_ALARM,
     **known: Any,
 ) -> LocatedDamage:
@@ -211,7 +212,7 @@ def _damaged(candidates: Candidates) -> FittedStructure:
 
     first = _from_scan(candidates.problem(*_first_terms(candidates)))
     damaged, n_fewer = candidates.best(continued, near=first, exhaust=False), 0
-    for _ in range(LOSS.most_looks):
+    for _ in range(LOSS.max_further_searches):
         if damaged.explains or n_fewer >= max(damaged.n_terms):
             break
         least = candidates.mass_terms[0], candidates.stiffness_terms[0]
@@ -220,7 +221,7 @@ def _damaged(candidates: Candidates) -> FittedStructure:
         if other.criterion < damaged.criterion - 1.0:
             damaged, n_fewer = _best_beside(candidates, other), 0
         else:
-            n_fewer += LOSS.fewer_terms
+            n_fewer += LOSS.term_reduction
     return damaged
 
 
@@ -298,44 +299,44 @@ def _likeliest(problem: Problem, starts: Sequence[tuple[FittedStructure, LocalLo
 def _likely_losses(problem: Problem, intact: FittedStructure) -> list[LocalLoss]:
     """Losses at the peaks of `scan`, for each width; none where no loss lowers χ²."""
     places, gains = scan(problem, intact)
-    widths = zip(LOSS.widths, gains, strict=True)
+    widths = zip(LOSS.trial_widths, gains, strict=True)
     length = problem.series.nominal.length
     return [LocalLoss(0.1, float(places[i]), width * length) for width, gain in widths for i in _highest_peaks(gain)]
 
 
 def _highest_peaks(gain: np.ndarray) -> list[int]:
-    """Indices of the highest local maxima of a gain along the structure, at most `LOSS.most_starts`."""
+    """Indices of the highest local maxima of a gain along the structure, at most `LOSS.starts_per_width`."""
     peaks = np.flatnonzero(np.r_[True, gain[1:] >= gain[:-1]] & np.r_[gain[:-1] >= gain[1:], True] & (gain > 0.0))
-    return sorted(peaks.tolist(), key=lambda i: -gain[i])[: LOSS.most_starts]
+    return sorted(peaks.tolist(), key=lambda i: -gain[i])[: LOSS.starts_per_width]
 
 
 def scan(problem: Problem, undamaged: FittedStructure) -> tuple[np.ndarray, np.ndarray]:
-    """First-order decrease of χ² by a loss of each of `LOSS.widths` at places along the structure.
+    """First-order decrease of χ² by a loss of each of `LOSS.trial_widths` at places along the structure.
 
     Returns:
         places (n_places,), m; decrease (n_widths, n_places).
     """
     length, stiffness = problem.series.nominal.length, problem.series.stiffness
-    places = (np.arange(LOSS.places) + 0.5) / LOSS.places * length
+    places = (np.arange(LOSS.trial_places) + 0.5) / LOSS.trial_places * length
     e = undamaged.parameters[undamaged.n_terms[0] :]
 
     def with_losses(x: np.ndarray) -> np.ndarray:
         terms = stiffness.functions(x)
-        hats = np.maximum(1.0 - np.abs(x[:, None] - places) * LOSS.places / length, 0.0)
+        hats = np.maximum(1.0 - np.abs(x[:, None] - places) * LOSS.trial_places / length, 0.0)
         return np.hstack([terms, -(1.0 + terms @ e)[:, None] * hats])
 
     breaks = tuple(np.linspace(0.0, length, 11))
-    with_hats = Basis(with_losses, e.size + LOSS.places, (*stiffness.breaks, *breaks))
+    with_hats = Basis(with_losses, e.size + LOSS.trial_places, (*stiffness.breaks, *breaks))
     mass_held, (particular, free) = problem.held
-    stiffness_held = np.r_[particular, np.zeros(LOSS.places)], block_diag(free, np.eye(LOSS.places))
+    stiffness_held = np.r_[particular, np.zeros(LOSS.trial_places)], block_diag(free, np.eye(LOSS.trial_places))
     trial = replace(problem, series=replace(problem.series, stiffness=with_hats), held=(mass_held, stiffness_held))
-    residuals, slopes = trial.residuals(np.r_[problem.free_of(undamaged.parameters), np.zeros(LOSS.places)])
+    residuals, slopes = trial.residuals(np.r_[problem.free_of(undamaged.parameters), np.zeros(LOSS.trial_places)])
     # the part of each effect orthogonal to the smooth series
-    smooth = np.linalg.qr(slopes[:, : -LOSS.places])[0]
-    effects = slopes[:, -LOSS.places :] - smooth @ (smooth.T @ slopes[:, -LOSS.places :])
+    smooth = np.linalg.qr(slopes[:, : -LOSS.trial_places])[0]
+    effects = slopes[:, -LOSS.trial_places :] - smooth @ (smooth.T @ slopes[:, -LOSS.trial_places :])
     distance = np.abs(places[:, None] - places) / length
     gains = []
-    for width in LOSS.widths:
+    for width in LOSS.trial_widths:
         losses = effects @ (distance < 0.5 * width)
         gains.append(np.maximum(-losses.T @ residuals, 0.0) ** 2 / np.maximum((losses**2).sum(axis=0), 1e-300))
     return places, np.array(gains)
@@ -357,7 +358,7 @@ def _whole_mass(problem: Problem) -> float:
 def _likely_masses(problem: Problem, intact: FittedStructure) -> list[PointMass]:
     """Point masses at the peaks of the first-order decrease of χ² along the structure."""
     z, whole = free_near(problem, intact), _whole_mass(problem)
-    step = LOSS.first_mass * whole
+    step = LOSS.mass_step * whole
     residuals, slopes = problem.residuals(z)
     smooth = np.linalg.qr(slopes)[0]
     places = np.linspace(0.0, problem.series.nominal.length, LOSS.mass_places)
@@ -388,7 +389,7 @@ def _fit_near_mass(problem: Problem, near: FittedStructure, part: PointMass) -> 
 
     start = np.r_[free_near(problem, near), np.clip([part.at, part.pair[0]] / scale, 1e-4, [1.0 - 1e-4, np.inf])]
     bounds = np.r_[np.full(n_free, -np.inf), least], np.r_[np.full(n_free, np.inf), most]
-    z = CachedResidual(fit).least(start, PROBLEM.most_steps, bounds=bounds, ftol=1e-5)
+    z = CachedResidual(fit).least(start, PROBLEM.max_steps, bounds=bounds, ftol=1e-5)
     found = report(_with_point_mass(problem, *(z[-2:] * scale)), z[:-2])
     penalised = found.criterion + 2.0 * problem.task.penalty
     return replace(found, degrees_of_freedom=found.degrees_of_freedom - 2, criterion=penalised)

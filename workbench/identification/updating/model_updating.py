@@ -24,13 +24,15 @@ from workbench.structure.printed import Printed, counted, warns_of_remarks
 class UpdatingSettings:
     """Constants of model updating."""
 
-    least_mac: float = 0.5  # below it a measured mode is no mode of the model
+    min_mac: float = 0.5  # below it a measured mode is no mode of the model
     doubtful_mac: float = 0.9  # below it the shapes differ: correlated modes are above (Ewins)
-    unlikely: float = 0.01  # chance of a false remark that the frequencies are not explained
-    at_edge: float = 0.01  # decrease of χ² expected of a further step, above which the search is not at a minimum
-    repeated: float = 0.01  # relative difference of repeated frequencies: small imperfections mix closer modes
-    step: float = 1e-4  # of the logarithm of a parameter, for central differences
-    indistinct: float = 1e-6  # smallest over largest singular value of the scaled Jacobian, of equivalent parameters
+    false_alarm: float = 0.01  # chance of a false remark that the frequencies are not explained
+    # decrease of χ² expected of a further step, above which the search is not at a minimum
+    cost_tolerance: float = 0.01
+    repeated_tolerance: float = 0.01  # relative difference of frequencies: small imperfections mix closer modes
+    difference_step: float = 1e-4  # of the logarithm of a parameter, for central differences
+    # smallest over largest singular value of the scaled Jacobian, of equivalent parameters
+    min_singular_ratio: float = 1e-6
 
 
 UPDATING = UpdatingSettings()
@@ -80,7 +82,7 @@ class UpdatedModel(Printed):
         remarks = [] if self.converged else [f"not converged: {self.reason}"]
         degrees_of_freedom = self.residuals.size - self.parameters.size
         chi2 = float(self.residuals @ self.residuals)
-        limit = float(chi2_distribution.isf(UPDATING.unlikely, degrees_of_freedom))
+        limit = float(chi2_distribution.isf(UPDATING.false_alarm, degrees_of_freedom))
         if degrees_of_freedom and chi2 > limit:
             remarks.append(
                 f"the frequencies are not explained: χ² is {chi2:.4g}, and noise alone gives at most {limit:.4g}; the"
@@ -151,9 +153,9 @@ def update_model(
         if not isinstance(modes, Modes):
             raise ValueError(f"build must return modes, as model.modes(8) does; got {type(modes).__name__}")
         model_shapes = modes.phi(places)
-        cluster = _joined(repeated_modes(modes.omega, UPDATING.repeated), model_shapes, measured, target)
+        cluster = _joined(repeated_modes(modes.omega, UPDATING.repeated_tolerance), model_shapes, measured, target)
         rows, columns, agreement = assigned(measured, model_shapes, cluster)
-        if rows.size < target.size or agreement[rows, columns].min() < UPDATING.least_mac:
+        if rows.size < target.size or agreement[rows, columns].min() < UPDATING.min_mac:
             worst = int(np.argmin(agreement.max(axis=1)))
             raise ValueError(
                 f"measured mode {worst + 1}, {target[worst] / (2 * np.pi):.4g} Hz, resembles no mode of the model: the"
@@ -179,20 +181,20 @@ def update_model(
 
     def jacobian(logarithms: np.ndarray) -> np.ndarray:
         columns = []
-        for step in UPDATING.step * np.eye(first.size):
+        for step in UPDATING.difference_step * np.eye(first.size):
             sides = [(side, residuals(logarithms + side * step)) for side in (-1.0, 1.0)]
             valid = [(side, values) for side, values in sides if (values != NO_MODEL).any()]
             if len(valid) < 2:  # at the edge of the domain where the model has such modes: one-sided
                 valid.append((0.0, residuals(logarithms)))
             (before, low), (after, high) = valid[0], valid[-1]
-            columns.append((high - low) / ((after - before or 1.0) * UPDATING.step))
+            columns.append((high - low) / ((after - before or 1.0) * UPDATING.difference_step))
         return np.column_stack(columns)
 
     paired(build(first))  # a start without such modes is an error of the user
     solution = least_squares(residuals, np.zeros(first.size), jac=jacobian, method="lm")
     parameters = first * np.exp(solution.x)
     singular = np.linalg.svd(solution.jac, compute_uv=False)
-    if singular[-1] <= UPDATING.indistinct * singular[0]:
+    if singular[-1] <= UPDATING.min_singular_ratio * singular[0]:
         raise ValueError(
             "the measured frequencies cannot distinguish the parameters: some change them alike, as stiffnesses in two"
             " directions do where repeated modes are turned half-way between; choose fewer"
@@ -201,7 +203,7 @@ def update_model(
     columns, agreement, _ = paired(modes)
     covariance = np.linalg.inv(solution.jac.T @ solution.jac) * np.outer(parameters, parameters)
     converged, reason = bool(solution.success), str(solution.message)
-    if refused and ((np.linalg.qr(solution.jac)[0].T @ solution.fun) ** 2).sum() > UPDATING.at_edge:
+    if refused and ((np.linalg.qr(solution.jac)[0].T @ solution.fun) ** 2).sum() > UPDATING.cost_tolerance:
         converged = False
         reason = f"beyond these parameters the model has no such modes ({refused[-1]}); choose other parameters"
     return UpdatedModel(parameters, covariance, modes, columns, agreement, solution.fun, converged, reason)
@@ -215,7 +217,7 @@ def _joined(cluster: np.ndarray, model_shapes: np.ndarray, measured: np.ndarray,
     """
     cluster, order = cluster.copy(), np.argsort(omega)
     repeated = np.empty(omega.size, int)
-    repeated[order] = repeated_modes(omega[order], UPDATING.repeated)
+    repeated[order] = repeated_modes(omega[order], UPDATING.repeated_tolerance)
     for each in np.unique(repeated):
         basis = np.linalg.qr(measured[:, repeated == each])[0]
         share = (np.abs(basis.conj().T @ model_shapes) ** 2).sum(axis=0) / (np.abs(model_shapes) ** 2).sum(axis=0)

@@ -31,10 +31,10 @@ from workbench.threads import one_blas_thread
 class StructureSettings:
     """Constants of the report and of the selection of terms."""
 
-    unlikely: float = 0.01  # chance that a structure is refused as an explanation of its own modes
+    refusal_probability: float = 0.01  # of a structure as an explanation of its own modes
     draws: int = 1000  # Monte Carlo samples of the structure, for confidence bands
-    most_terms: int = 8  # of mass and of stiffness, unless given
-    spare: int = 2  # further terms that are free in the confidence bands
+    max_terms: int = 8  # of mass and of stiffness, unless given
+    spare_terms: int = 2  # further terms that are free in the confidence bands
 
 
 STRUCTURE = StructureSettings()
@@ -122,7 +122,7 @@ class FittedStructure(Printed):
     @property
     def limit(self) -> float:
         """The 0.99 quantile of `chi2` by noise alone."""
-        return float(chi2_distribution.isf(STRUCTURE.unlikely, self.degrees_of_freedom))
+        return float(chi2_distribution.isf(STRUCTURE.refusal_probability, self.degrees_of_freedom))
 
     @property
     def explains(self) -> bool:
@@ -162,8 +162,8 @@ def fitted(problem: Problem, near: FittedStructure | None = None, loss: LocalLos
     low, high = np.full(z.size, -np.inf), np.full(z.size, np.inf)
     if loss is not None:
         z = np.r_[z, loss.share, loss.centre, loss.width]
-        low = np.r_[low, 0.0, 0.0, PROBLEM.narrowest * length]
-        high = np.r_[high, PROBLEM.most_lost, length, PROBLEM.widest * length]
+        low = np.r_[low, 0.0, 0.0, PROBLEM.min_loss_width * length]
+        high = np.r_[high, PROBLEM.max_loss, length, PROBLEM.max_loss_width * length]
         z[-3:] = np.clip(z[-3:], *(0.999 * low[-3:] + 0.001 * high[-3:], 0.001 * low[-3:] + 0.999 * high[-3:]))
     if z.size == 0:
         return report(problem, z)
@@ -172,7 +172,7 @@ def fitted(problem: Problem, near: FittedStructure | None = None, loss: LocalLos
     residuals = CachedResidual(problem.residuals)
 
     def search(z: np.ndarray) -> np.ndarray:
-        return residuals.least(z, PROBLEM.most_steps, bounds=(low, high), ftol=1e-5, xtol=1e-9, gtol=1e-9)
+        return residuals.least(z, PROBLEM.max_steps, bounds=(low, high), ftol=1e-5, xtol=1e-9, gtol=1e-9)
 
     found = search(z)
     if loss is not None:
@@ -209,7 +209,7 @@ def report(problem: Problem, z: np.ndarray) -> FittedStructure:
     parameters = np.r_[d, e, z[n_free:]]
     coefficient_jacobian = problem.coefficient_jacobian(z)
     covariance = coefficient_jacobian @ problem.covariance(z) @ coefficient_jacobian.T
-    if degrees_of_freedom > 0 and chi2 > chi2_distribution.isf(STRUCTURE.unlikely, degrees_of_freedom):
+    if degrees_of_freedom > 0 and chi2 > chi2_distribution.isf(STRUCTURE.refusal_probability, degrees_of_freedom):
         covariance = covariance * chi2 / degrees_of_freedom
     std = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     root = symmetric_root(covariance / np.outer(std, std))
@@ -304,8 +304,8 @@ def choose_structure(
     nominal: Bar | Beam,
     *,
     basis: Callable[[int], Basis] | None = None,
-    mass_terms: Iterable[int] = range(1, STRUCTURE.most_terms + 1),
-    stiffness_terms: Iterable[int] = range(1, STRUCTURE.most_terms + 1),
+    mass_terms: Iterable[int] = range(1, STRUCTURE.max_terms + 1),
+    stiffness_terms: Iterable[int] = range(1, STRUCTURE.max_terms + 1),
     **known: Any,
 ) -> FittedStructure:
     """Mass and stiffness as series, their numbers of terms selected by `FittedStructure.criterion`.
@@ -393,7 +393,7 @@ class Candidates:
         Ann. Statist. 20, 1992).
         """
         try:
-            problem = self.problem(*(n + STRUCTURE.spare if n else 0 for n in chosen.n_terms))
+            problem = self.problem(*(n + STRUCTURE.spare_terms if n else 0 for n in chosen.n_terms))
             wider = report(problem, free_near(problem, chosen))
         except ValueError:
             return chosen

@@ -31,12 +31,12 @@ from workbench.structure.modes import mac
 class ProblemSettings:
     """Constants of the data and of the fit of a structure."""
 
-    trusted: float = 1e-8  # relative error of the model, below which no standard error counts
-    same_mode: float = 0.6  # least MAC of a measured mode with the nominal structure's mode paired with it
-    narrowest: float = 0.02  # of the length: a narrower loss is a crack
-    widest: float = 0.5  # of the length: a wider loss is not local
-    most_lost: float = 0.95  # of the stiffness
-    most_steps: int = 25  # of least squares
+    model_error: float = 1e-8  # relative error of the model, below which no standard error counts
+    min_mac: float = 0.6  # of a measured mode with the nominal structure's mode paired with it
+    min_loss_width: float = 0.02  # of the length: a narrower loss is a crack
+    max_loss_width: float = 0.5  # of the length: a wider loss is not local
+    max_loss: float = 0.95  # of the stiffness
+    max_steps: int = 25  # of least squares
 
 
 PROBLEM = ProblemSettings()
@@ -108,7 +108,8 @@ class Task:
         unit_shapes = []
         for covariance, k in zip(measured.shape_covariance, reference, strict=True):
             others = np.delete(np.delete(covariance, k, axis=0), k, axis=1)
-            unit_shapes.append(_whitening_matrix(others + PROBLEM.trusted**2 * np.eye(m - 1)))
+            unit_shapes.append(_whitening_matrix(others + PROBLEM.model_error**2 * np.eye(m - 1)))
+        omega_covariance = measured.covariance[:n, :n] + np.diag((PROBLEM.model_error * modes.omega) ** 2)
         domain = Interval(nominal.length)
         which = _paired(measured, nominal) if numbers is None else np.asarray(numbers, int) - 1
         if which.shape != (n,) or (which < 0).any() or np.unique(which).size < n:
@@ -121,7 +122,7 @@ class Task:
             which=which,
             reference=reference,
             shapes=(modes.shapes / modes.shapes[reference, np.arange(n)]).real,
-            unit_omega=_whitening_matrix(measured.covariance[:n, :n] + np.diag((PROBLEM.trusted * modes.omega) ** 2)),
+            unit_omega=_whitening_matrix(omega_covariance),
             unit_shapes=tuple(unit_shapes),
         )
 
@@ -145,7 +146,7 @@ def _paired(measured: RefinedModes, nominal: Bar | Beam) -> np.ndarray:
     agreement = mac(normalised_shapes(modes.shapes).real, solved.modes(np.arange(n))[1])
     pairs = linear_sum_assignment(-agreement)[1]
     worst = int(np.argmin(agreement[np.arange(modes.n_modes), pairs]))
-    if agreement[worst, pairs[worst]] < PROBLEM.same_mode:
+    if agreement[worst, pairs[worst]] < PROBLEM.min_mac:
         raise ValueError(
             f"measured mode {worst + 1} at {modes.frequencies_hz[worst]:.4g} Hz resembles no mode of the nominal"
             f" structure (best MAC {agreement[worst].max():.2f}); leave it out, correct the ends, or give numbers"
