@@ -40,7 +40,7 @@ class DelaysSettings:
     block_rows: int = 4096  # of the data matrix held at once
     round_off: float = 1e-8  # of the ratio of an output to an input
     phase_weight: float = 1.0  # of the phase of the modes beside the χ² of the columns
-    half_weight_chi2: float = 100.0  # χ² of a mode at which it has half of that weight
+    half_weight_statistic: float = 100.0  # χ² of a mode at which it has half of that weight
 
 
 DELAYS = DelaysSettings()
@@ -241,7 +241,7 @@ def _phases(data: KnownInputs, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     mean_phase = np.exp(-0.5j * np.angle((displacements**2).sum(axis=0)))
     statistic = statistic_of_each(fit)
     size = np.abs(fit.participation[:, :q]) ** 2
-    weight = (statistic / (statistic + DELAYS.half_weight_chi2))[:, None] * size / size.sum(axis=1, keepdims=True)
+    weight = (statistic / (statistic + DELAYS.half_weight_statistic))[:, None] * size / size.sum(axis=1, keepdims=True)
     return np.angle(1j * fit.participation[:, :q] / mean_phase[:, None]), weight
 
 
