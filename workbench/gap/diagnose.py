@@ -286,7 +286,7 @@ def _input_noise(found: Attribution, outcome: str) -> float:
 
     Whatever is missing then fills it.
     """
-    return 0.0 if found.logged >= LOGGED.most and outcome in ("part", "unknown") else found.logged
+    return 0.0 if found.logged >= LOGGED.max_share and outcome in ("part", "unknown") else found.logged
 
 
 def _leaves_unexplained(budget: Budget, power: float, tolerance: float) -> bool:

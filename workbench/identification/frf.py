@@ -480,7 +480,7 @@ def _clustered(
         return fit, cluster_hz
     mean_poles = fit.poles.copy()
     for r, others in members.items():
-        cluster = [r, *(k for k in others if np.abs(fit.poles.real[k]) < PEAKS.narrow * np.abs(fit.poles.real[r]))]
+        cluster = [r, *(k for k in others if np.abs(fit.poles.real[k]) < PEAKS.max_width * np.abs(fit.poles.real[r]))]
         mean_poles[r] = np.average(fit.poles[cluster], weights=selected.statistic[cluster])
     return settled(lines, projected(lines, mean_poles[kept], fit.participation[kept])), cluster_hz
 

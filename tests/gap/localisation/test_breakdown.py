@@ -166,7 +166,7 @@ def test_a_long_record_is_placed_by_some_of_its_lines(rig, measured, monkeypatch
     real = replace(rig, elements=(CubicSpring(1.37, 300.0),))
     records = [measured(real, str(seed), 0.3, seed) for seed in (2, 3)]
     every = placed_by(rig, records)
-    monkeypatch.setattr(force_lines, "LINES", replace(force_lines.LINES, most_lines=300))
+    monkeypatch.setattr(force_lines, "LINES", replace(force_lines.LINES, max_lines=300))
     fewer = placed_by(rig, records)
     assert fewer.is_single_force and every.at_std < fewer.at_std < 8.0 * every.at_std
     assert abs(fewer.at - 1.37) < 4.0 * fewer.at_std

@@ -9,7 +9,7 @@ import pytest
 
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect
-from workbench.gap.prediction.innovations import LOOSE, Observer, _is_growing
+from workbench.gap.prediction.innovations import PROCESS_NOISE, Observer, _is_growing
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import sampled_model
 from workbench.gap.search.fit import cost_of
@@ -39,7 +39,8 @@ def test_errors_beside_the_forces_that_are_believed_are_white(hinged_rig, quanti
     rig, rng, dt, noise = hinged_rig(4), np.random.default_rng(1), 0.01, np.full(4, 1e-5)
     rig = replace(rig, sensors=tuple(replace(s, quantity=quantity) for s in rig.sensors))
     model, middle = sampled_model(rig.modes, rig.sensors, noise, dt), (np.arange(50) + 0.5) / 50 * rig.modes.length
-    forces = LOOSE * np.sqrt(np.mean(rig.modes.phi(middle) ** 2, axis=0))[:, None] * rng.normal(size=(4, 20_000))
+    shares = np.sqrt(np.mean(rig.modes.phi(middle) ** 2, axis=0))
+    forces = PROCESS_NOISE * shares[:, None] * rng.normal(size=(4, 20_000))
     state, outputs = np.zeros(8), np.empty((4, 20_000))
     for k in range(20_000):
         outputs[:, k] = model.output @ state + model.feedthrough @ forces[:, k]

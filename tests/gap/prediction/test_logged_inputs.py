@@ -51,7 +51,7 @@ def test_how_loud_it_is(rig, logged):
 def test_none_is_told_from_some(rig, record_of):
     rng = np.random.default_rng(4)
     quiet = FitData((record_of(rig, rng.normal(size=(2, 1000)), rng, name="quiet"),), np.full(4, NOISE))
-    assert likeliest_share(rig, quiet, quiet.differences(rig)).share < 0.1 * LOGGED.most
+    assert likeliest_share(rig, quiet, quiet.differences(rig)).share < 0.1 * LOGGED.max_share
 
 
 def test_records_show_it_under_sensor_noise_of_five_times_its_response(rig, logged, record_of):

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import butter, lfilter, lsim
 
 from workbench.gap.prediction.random_force import (
-    TONAL,
+    MAX_TONAL_SHARE,
     _power,
     fit_random_force,
     followed,
@@ -36,7 +36,7 @@ def record():
 def test_a_constant_and_a_tone_can_be_predicted_and_a_random_force_cannot(memory):
     force = lfilter([1.0], [1.0, -memory], np.random.default_rng(2).normal(size=N))
     wave = np.sin(0.3 * np.arange(N) + 0.4)
-    assert tonal(force, 0.01) < TONAL
+    assert tonal(force, 0.01) < MAX_TONAL_SHARE
     assert tonal(1e-3 * force / force.std() - 1.0, 0.01) == pytest.approx(1.0, abs=1e-5)
     assert tonal(wave + 2.0, 0.01) == pytest.approx(1.0, abs=1e-3)
 

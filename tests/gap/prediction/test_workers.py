@@ -12,10 +12,10 @@ import pytest
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect
 from workbench.gap.prediction import workers as module
-from workbench.gap.prediction.workers import FORKS, LEFT_OVER, MOST_TURNS, Workers
+from workbench.gap.prediction.workers import BACKGROUND_NICENESS, CAN_FORK, MAX_TURNS, Workers
 
 TWO = Workers(2)
-forked = pytest.mark.skipif(not FORKS, reason="processes are forked on Linux only")
+forked = pytest.mark.skipif(not CAN_FORK, reason="processes are forked on Linux only")
 
 
 @pytest.fixture
@@ -75,7 +75,7 @@ def test_what_is_computed_in_the_background_is_computed_once_beside_work_that_is
     ):
         assert workers.map(lambda i: i + 1, range(5)) == [1, 2, 3, 4, 5]
         assert other() == other() == [0, 1, 4, 9, 16]
-        assert (one() == os.getpid()) == (number == 1 or not FORKS)
+        assert (one() == os.getpid()) == (number == 1 or not CAN_FORK)
 
 
 @forked
@@ -83,7 +83,7 @@ def test_work_in_the_background_gives_way_to_others_and_its_failure_is_raised_wh
     def fails():
         raise ValueError(f"niceness {os.nice(0)}")
 
-    nicest = min(os.nice(0) + LEFT_OVER, 19)  # 19 is the most there is
+    nicest = min(os.nice(0) + BACKGROUND_NICENESS, 19)  # 19 is the most there is
     with TWO.in_background(fails) as asked, pytest.raises(ValueError, match=rf"niceness {nicest}\b"):
         asked()
 
@@ -121,7 +121,7 @@ def test_nobody_waits_for_work_in_the_background_that_is_not_asked_for(helpers):
     assert time.perf_counter() - begun < 30
 
 
-@pytest.mark.parametrize("n", [MOST_TURNS - 1, MOST_TURNS, 2 * MOST_TURNS + 1])
+@pytest.mark.parametrize("n", [MAX_TURNS - 1, MAX_TURNS, 2 * MAX_TURNS + 1])
 def test_more_items_than_a_pipe_holds_are_all_done_once(n):
     assert TWO.map(lambda i: i, range(n)) == list(range(n))
 
@@ -256,8 +256,8 @@ def test_a_failure_of_processes_that_stand_by_is_raised_whoever_fails(number, mo
             raise ValueError("no rig 7")
         return i
 
-    for forks in (FORKS, False):
-        monkeypatch.setattr(module, "FORKS", forks)
+    for forks in (CAN_FORK, False):
+        monkeypatch.setattr(module, "CAN_FORK", forks)
         with Workers(number).pool(fails) as share:
             assert share(range(5)) == list(range(5))
             with pytest.raises(ValueError, match="no rig 7"):
@@ -265,12 +265,12 @@ def test_a_failure_of_processes_that_stand_by_is_raised_whoever_fails(number, mo
 
 
 def test_where_nothing_is_forked_threads_do_it(monkeypatch):
-    monkeypatch.setattr(module, "FORKS", False)
+    monkeypatch.setattr(module, "CAN_FORK", False)
     assert TWO.map(lambda i: (os.getpid(), i), range(5)) == [(os.getpid(), i) for i in range(5)]
 
 
 def test_a_process_is_one_at_least():
-    assert 1 <= Workers.at_hand().number <= module.MOST
+    assert 1 <= Workers.at_hand().number <= module.MAX_PROCESSES
     with pytest.raises(ValueError, match="1 or more; got 0"):
         Workers(0)
 

@@ -82,5 +82,5 @@ def test_a_looser_observer_shows_what_grows_slowly(search):
     """A frequency off by 0.1 % is next to nothing from sample to sample, and drifts out of phase over a record."""
     modes = replace(search.rig.modes, omega=1.001 * search.rig.modes.omega)
     off = replace(search, rig=replace(search.rig, modes=modes))
-    costs = [replace(off, loose=loose).nominal_ahead for loose in (1e-2, 1e-3, 1e-4)]
+    costs = [replace(off, process_noise=process_noise).nominal_ahead for process_noise in (1e-2, 1e-3, 1e-4)]
     assert costs[0] < costs[1] < costs[2]

@@ -10,7 +10,7 @@ from workbench.gap.diagnose import _leaves_far_more_than_noise, _over_fits
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect, apply_all, merged_sets, simpler_forms, with_two_as_one
 from workbench.gap.effects.nominal import NominalPrior, nominal_errors
-from workbench.gap.prediction.innovations import LOOSE
+from workbench.gap.prediction.innovations import PROCESS_NOISE
 from workbench.gap.prediction.random_force import tonal
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import force_filter, sampled_model, whiten
@@ -65,7 +65,7 @@ def test_predictions_ahead_err_by_the_innovations_of_the_filter_where_all_is_lin
     record = record_of(real, np.repeat(rng.normal(size=30), 10)[None], rng)
     data = FitData((record,), np.full(4, NOISE))
     places = (np.arange(50) + 0.5) / 25
-    forces = LOOSE * data.force_rms * np.sqrt(np.mean(rig.modes.phi(places) ** 2, axis=0))
+    forces = PROCESS_NOISE * data.force_rms * np.sqrt(np.mean(rig.modes.phi(places) ** 2, axis=0))
     kalman = force_filter(sampled_model(rig.modes, rig.sensors, data.noise, DT), np.eye(6), forces**2)
     expected = whiten(kalman, data.residual(rig).reshape(4, -1) * NOISE)
     np.testing.assert_allclose(data.one_step_ahead(rig).residual(rig).reshape(4, -1), expected, atol=1e-6)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from workbench.gap.setup.comparison import LARGEST_LOG_RATIO, Spectra, band_misfit, compared_bands
+from workbench.gap.setup.comparison import MAX_LOG_RATIO, Spectra, band_misfit, compared_bands
 
 F = np.array([2.0, 6.0, 11.0])  # Hz: bands end at 4 and 8.5
 T = np.arange(4000) * 0.01
@@ -27,7 +27,7 @@ def test_a_factor_is_its_logarithm_and_a_turned_sign_two():
     assert band_misfit(read(5.0 * y), read(y)) == pytest.approx(np.full((1, 1, 3), np.log(5.0)))
     assert band_misfit(read(-y), read(y)) == pytest.approx(np.full((1, 1, 3), 2.0))
     assert band_misfit(read(-5.0 * y), read(y), -5.0) == pytest.approx(np.zeros((1, 1, 3)), abs=1e-9)
-    assert band_misfit(read(1e6 * y), read(y)) == pytest.approx(np.full((1, 1, 3), LARGEST_LOG_RATIO))
+    assert band_misfit(read(1e6 * y), read(y)) == pytest.approx(np.full((1, 1, 3), MAX_LOG_RATIO))
 
 
 def test_a_phase_is_one_less_its_cosine_in_its_own_band():
@@ -42,5 +42,5 @@ def test_bands_with_little_of_a_signal_are_not_compared():
 
 def test_a_prediction_of_nothing_or_beyond_all_numbers_is_like_nothing():
     y = tone(2.0)
-    assert (band_misfit(read(y), read(0.0 * y)) >= LARGEST_LOG_RATIO).all()
-    assert (band_misfit(read(y), read(1e200 * y)) >= LARGEST_LOG_RATIO).all()
+    assert (band_misfit(read(y), read(0.0 * y)) >= MAX_LOG_RATIO).all()
+    assert (band_misfit(read(y), read(1e200 * y)) >= MAX_LOG_RATIO).all()

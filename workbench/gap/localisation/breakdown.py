@@ -21,22 +21,22 @@ from workbench.rig.rig import Rig, participation_of
 class BreakdownSettings:
     """Constants of the breakdown of the gap."""
 
-    mode_share: float = 0.05  # of the gap: modes with more are named
-    one_sensor: float = 0.97  # of the gap: with more in one sensor, that sensor alone disagrees
+    min_mode_share: float = 0.05  # of the gap: modes with more are named
+    one_sensor_share: float = 0.97  # of the gap: with more in one sensor, that sensor alone disagrees
     octaves: int = 8  # below half the sample rate
-    clear: float = 0.1  # of the noise: a gap above it by less does not count
-    # of the frequency of a mode: resonators about it. The response of lightly damped modes is longer than any segment
-    # of a record, so that coherence by averaged spectra would miss most of it; a change of a mode's frequency, damping
-    # or gain lies nearly in the span of resonators close to the mode
-    spread: tuple[float, ...] = (0.85, 0.93, 0.97, 0.99, 1.0, 1.01, 1.03, 1.07, 1.15)
-    most_modes: int = 6  # that have resonators
-    rigid: float = 0.5  # of the frequency of the first elastic mode: the end of the band of rigid modes
-    above: float = 1.15  # of the frequency of the last mode: the end of its band
-    louder: float = 2.0  # ratio of levels or gaps: smaller ones say nothing of a dependence on amplitude
-    linear: float = 0.9  # of the gap's power: if a linear model explains more, the gap is linear
-    silent: float = 1e-3  # of the largest line of the inputs: lines below it are not excited
-    distorted: float = 10.0  # power of the gap on lines not excited over that of noise: more is distortion
-    hum: int = 3  # strongest of these lines in each octave that do not count, as they may be mains hum
+    noise_margin: float = 0.1  # of the noise: a gap above it by less does not count
+    # of the frequencies of resonators about a mode to its own. The response of lightly damped modes is longer than any
+    # segment of a record, so that coherence by averaged spectra would miss most of it; a change of a mode's frequency,
+    # damping or gain lies nearly in the span of resonators close to the mode
+    tuning_ratios: tuple[float, ...] = (0.85, 0.93, 0.97, 0.99, 1.0, 1.01, 1.03, 1.07, 1.15)
+    max_modes: int = 6  # that have resonators
+    rigid_band_ratio: float = 0.5  # of the frequency of the first elastic mode: the end of the band of rigid modes
+    last_band_ratio: float = 1.15  # of the frequency of the last mode: the end of its band
+    level_ratio: float = 2.0  # of levels or gaps: smaller ones say nothing of a dependence on amplitude
+    min_linear_share: float = 0.9  # of the gap's power: if a linear model explains more, the gap is linear
+    unexcited_share: float = 1e-3  # of the largest line of the inputs: lines below it are not excited
+    min_distortion_ratio: float = 10.0  # power of the gap on lines not excited over that of noise: more is distortion
+    hum_lines: int = 3  # strongest of these lines in each octave that do not count, as they may be mains hum
     periods: int = 3  # last periods of a record that are used; the first of them only for the drift
 
 
@@ -92,7 +92,7 @@ class GapBreakdown:
     @property
     def is_distorted(self) -> bool:
         """Whether periodic inputs show a nonlinearity, before any law is assumed."""
-        return bool(self.distortions.max() > BREAKDOWN.distorted)
+        return bool(self.distortions.max() > BREAKDOWN.min_distortion_ratio)
 
     @property
     def at(self) -> Any:
@@ -112,7 +112,7 @@ class GapBreakdown:
 
 def _is_clear(gaps: Floats, floors: Floats) -> Flags:
     """Whether the gap of each record (n_records,) is clearly above its noise."""
-    return np.asarray(gaps > (1.0 + BREAKDOWN.clear) * floors)
+    return np.asarray(gaps > (1.0 + BREAKDOWN.noise_margin) * floors)
 
 
 def break_down(reconstruction: ForceReconstruction, effects: Sequence[Effect], place: ForceLocation) -> GapBreakdown:
@@ -139,7 +139,7 @@ def break_down(reconstruction: ForceReconstruction, effects: Sequence[Effect], p
     distortions = np.array([_distortion(rig, record, residual) for record, residual in both])
     return GapBreakdown(
         path=_path(reconstruction, excess, floors.mean(axis=1), by_sensor, effects),
-        modes=tuple(int(r) + 1 for r in np.flatnonzero(in_band > BREAKDOWN.mode_share)),
+        modes=tuple(int(r) + 1 for r in np.flatnonzero(in_band > BREAKDOWN.min_mode_share)),
         amplitude_dependent=_amplitude_dependent(effects, gaps, noise, levels, share, distortions),
         mode_shares=mode_shares,
         share_above=above,
@@ -163,10 +163,10 @@ def _by_mode(frequencies: Floats, seen: Sequence[tuple[Floats, float, float]]) -
     Rigid modes share one band in equal parts; `seen`: as of `_shares_between`.
     """
     elastic = frequencies[frequencies > 0]
-    first = BREAKDOWN.rigid * elastic[:1] * (elastic.size < frequencies.size)  # zero: an empty band
+    first = BREAKDOWN.rigid_band_ratio * elastic[:1] * (elastic.size < frequencies.size)  # zero: an empty band
     # geometric means, as the width of a peak is proportional to its frequency; `setup.comparison`, which compares whole
     # signals, takes arithmetic means
-    edges = np.r_[0.0, first, np.sqrt(elastic[1:] * elastic[:-1]), BREAKDOWN.above * elastic[-1:], np.inf]
+    edges = np.r_[0.0, first, np.sqrt(elastic[1:] * elastic[:-1]), BREAKDOWN.last_band_ratio * elastic[-1:], np.inf]
     rigid, *others = _shares_between(edges, seen)
     above = others.pop() if others else 0.0  # with only rigid modes, there is one band
     n_rigid = frequencies.size - len(others)
@@ -219,7 +219,7 @@ def _path(
 
 def of_one_sensor(excess: np.ndarray) -> bool:
     """Whether one sensor alone disagrees, given the power above the noise of each (n_outputs,)."""
-    return bool(excess.max() > BREAKDOWN.one_sensor * excess.sum())
+    return bool(excess.max() > BREAKDOWN.one_sensor_share * excess.sum())
 
 
 def _amplitude_dependent(
@@ -230,10 +230,10 @@ def _amplitude_dependent(
         return any(effect.kind.nonlinear for effect in effects)
     above = np.sqrt(np.maximum(gaps**2 - floors**2, 0.0))
     sizes = above + floors
-    grows = sizes.max() > BREAKDOWN.louder * sizes.min() and above.max() > BREAKDOWN.louder * floors.max()
-    if grows or distortions.max() > BREAKDOWN.distorted:
+    grows = sizes.max() > BREAKDOWN.level_ratio * sizes.min() and above.max() > BREAKDOWN.level_ratio * floors.max()
+    if grows or distortions.max() > BREAKDOWN.min_distortion_ratio:
         return True
-    is_linear = linear > BREAKDOWN.linear and levels.max() > BREAKDOWN.louder * levels.min()
+    is_linear = linear > BREAKDOWN.min_linear_share and levels.max() > BREAKDOWN.level_ratio * levels.min()
     return False if is_linear else None
 
 
@@ -253,7 +253,7 @@ def _distortion(rig: Rig, record: Record, residual: Floats) -> Floats:
         found = distortion_of(replace(record, inputs=record.inputs[:, last], outputs=residual[:, last] - drift))
     except ValueError:  # these few periods do not repeat well enough
         return np.zeros(2)
-    free = found.input_amplitudes < BREAKDOWN.silent * found.input_amplitudes.max()
+    free = found.input_amplitudes < BREAKDOWN.unexcited_share * found.input_amplitudes.max()
     octave = np.floor(np.log2(np.arange(1, free.size + 1)))  # noise of other bands may be far louder
     decay = float((rig.modes.zeta * rig.modes.omega).min()) * period * record.sample_time
     settled = np.tanh(0.5 * decay) ** 2
@@ -261,8 +261,8 @@ def _distortion(rig: Rig, record: Record, residual: Floats) -> Floats:
     for i, lines in enumerate((found.odd & free, found.even & free)):
         for each in range(int(octave[-1]) + 1):
             chosen = lines & (octave == each)
-            if chosen.sum() > BREAKDOWN.hum:
-                power = np.sort(found.amplitudes[:, chosen] ** 2, axis=1)[:, : -BREAKDOWN.hum].sum(axis=1)
+            if chosen.sum() > BREAKDOWN.hum_lines:
+                power = np.sort(found.amplitudes[:, chosen] ** 2, axis=1)[:, : -BREAKDOWN.hum_lines].sum(axis=1)
                 noise = np.maximum((found.noise[:, chosen] ** 2).sum(axis=1), 1e-300)
                 most[i] = max(most[i], settled * float((power / noise).max()))
     return most
@@ -277,7 +277,7 @@ def linear_share(rig: Rig, seen: Sequence[tuple[Record, Floats]], shares: Floats
 
     shares: (n_modes,) of the gap around each mode; only the modes with the largest shares are used.
     """
-    chosen = [int(r) for r in np.argsort(-shares)[: BREAKDOWN.most_modes] if shares[r] > 0]
+    chosen = [int(r) for r in np.argsort(-shares)[: BREAKDOWN.max_modes] if shares[r] > 0]
     sizes = np.sqrt(np.mean([record.outputs.var(axis=1) for record, _ in seen], axis=0))[:, None]
     sizes = np.where(sizes > 0, sizes, 1.0)
     pieces = []
@@ -315,9 +315,9 @@ def _regressors(rig: Rig, chosen: Sequence[int], record: Record) -> np.ndarray:
         return record.inputs
     slowest = 2.0 * np.pi / (record.n_samples * record.sample_time)
     alone, acting = np.eye(len(rig.actuators)), participation_of(rig)
-    omega = np.maximum(rig.modes.omega[chosen], slowest)[:, None] * np.r_[np.ones(len(alone)), BREAKDOWN.spread]
+    omega = np.maximum(rig.modes.omega[chosen], slowest)[:, None] * np.r_[np.ones(len(alone)), BREAKDOWN.tuning_ratios]
     damping = np.maximum(np.diag(rig.modes.damping)[chosen, None], 1e-3 * omega)
-    driven = np.array([row for r in chosen for row in (*alone, *[acting[r]] * len(BREAKDOWN.spread))])
+    driven = np.array([row for r in chosen for row in (*alone, *[acting[r]] * len(BREAKDOWN.tuning_ratios))])
     resonators = modal_poles(omega.ravel(), np.diag(damping.ravel()))
     response_to = held_response if record.input_hold == "zero" else first_order_hold_response
     response, _ = response_to(resonators, record.inputs, driven, record.sample_time)

@@ -33,12 +33,12 @@ from workbench.rig.rig import Rig
 class LinesSettings:
     """Constants of the selection and weighting of lines."""
 
-    top: float = 0.9  # of half the sample rate: above, aliasing is not small
-    most_lines: int = 8192  # of a record: longer ones are thinned out, which only costs precision
-    width: int = 75  # lines over which the force spectrum is averaged
-    chance: float = 2.0  # standard errors of this average that are subtracted, as noise may cause them
-    counting: float = 0.02  # weight below which a line is left out
-    screened: int = 300  # strongest lines, that are used to compare many places
+    nyquist_share: float = 0.9  # of half the sample rate: above, aliasing is not small
+    max_lines: int = 8192  # of a record: longer ones are thinned out, which only costs precision
+    averaged_lines: int = 75  # in the average of the force spectrum
+    noise_deviations: float = 2.0  # standard errors of this average that are subtracted, as noise may cause them
+    min_weight: float = 0.02  # a line of a smaller weight is left out
+    screened_lines: int = 300  # the strongest ones, that are used to compare many places
     rounds: int = 4  # iterations of the force spectrum, each weighted by the one before
 
 
@@ -229,7 +229,7 @@ class Lines:
 
     def weighted(self, weights: np.ndarray) -> "Lines":
         """The lines with other weights (n_lines,), without those of negligible weight."""
-        kept = weights > LINES.counting
+        kept = weights > LINES.min_weight
         return self._on(kept, weights[kept])
 
     def strongest(self, most: int) -> "Lines":
@@ -258,7 +258,7 @@ class Lines:
             root = np.sqrt(share)
             end, _ = self._transient(u * root[:, None], a * root)
             read = (np.abs(a - u @ end) ** 2 - 1.0) / power
-            chance = LINES.chance * np.sqrt(_moving_sum((precision / power) ** 2))
+            chance = LINES.noise_deviations * np.sqrt(_moving_sum((precision / power) ** 2))
             spectrum = np.maximum(_moving_sum(precision * read) - chance, 0.0) / _moving_sum(precision)
             share = spectrum * power / (1.0 + spectrum * power)
             # bounded by rounding, for a force far above the noise
@@ -291,7 +291,7 @@ def screened(lines: Lines, shapes: np.ndarray) -> np.ndarray:
 
     The transient and weak lines are left out.
     """
-    left, lines = np.full(len(shapes), lines.power), lines.strongest(LINES.screened)
+    left, lines = np.full(len(shapes), lines.power), lines.strongest(LINES.screened_lines)
     to_force = [
         np.moveaxis(np.array([each.to_force(mode) for mode in np.eye(shapes.shape[1])]), 0, 2)
         for each in (lines.receptances, *lines.folded)
@@ -310,8 +310,8 @@ def screened(lines: Lines, shapes: np.ndarray) -> np.ndarray:
 
 
 def _moving_sum(values: np.ndarray) -> np.ndarray:
-    """Moving sum over `LINES.width` lines, (n_lines,)."""
-    width = min(LINES.width, values.size)
+    """Moving sum over `LINES.averaged_lines` lines, (n_lines,)."""
+    width = min(LINES.averaged_lines, values.size)
     return np.convolve(np.pad(values, (width // 2, width - 1 - width // 2), mode="edge"), np.ones(width), mode="valid")
 
 
@@ -323,8 +323,8 @@ def lines_of(rig: Rig, model: SampledModel, residuals: Sequence[np.ndarray], sam
     for residual in residuals:
         n = residual.shape[1]
         if n not in made:
-            top = max(int(0.5 * LINES.top * n), 2)
-            taken = np.arange(1, top, 1 + top // LINES.most_lines)
+            top = max(int(0.5 * LINES.nyquist_share * n), 2)
+            taken = np.arange(1, top, 1 + top // LINES.max_lines)
             rates = 2.0 * np.pi / sample_time * np.array([0, *_folds(rig, sample_time)])
             omega = 2.0 * np.pi * taken / (n * sample_time)
             made[n] = taken, [receptances_of(rig, model, omega + rate, n, sample_time) for rate in rates]

@@ -20,19 +20,19 @@ from workbench.threads import one_blas_thread
 class LocalisationSettings:
     """Constants of the localisation of one force."""
 
-    valleys: int = 3  # local minima of the misfit that are refined
+    refined_minima: int = 3  # of the misfit, local
     rounds: int = 3  # alternations between the place and the weights of the lines
-    resolved: float = 1e-3  # of the grid spacing: tolerance of the refinement
+    place_tolerance: float = 1e-3  # of the grid spacing, at the refinement
     pairs_shown: int = 12  # of named points
-    two_sigma: float = 4.0  # rise of the misfit at two standard errors
-    noise: float = 0.1  # of the noise power: largest excess of the residual given one force
-    all_but: float = 1e-5  # of the gap, likewise
-    chance: float = 3.0  # standard deviations of a sum of squares
-    edge: float = 1e-4  # of the length: least distance of a place from the ends
-    near: float = 0.02  # of a rectangle's size: first simplex about a peak
-    tolerance: float = 1e-2  # of the misfit, in units of the noise variance
-    evaluations: int = 60  # of the simplex search
-    curved_over: float = 0.1  # of that simplex: step of the second difference of the misfit
+    two_sigma_rise: float = 4.0  # of the misfit, at two standard errors
+    max_excess: float = 0.1  # of the noise power: of the residual given one force
+    unexplained_share: float = 1e-5  # of the gap, likewise
+    noise_deviations: float = 3.0  # of a sum of squares of noise
+    edge_distance: float = 1e-4  # of the length: least distance of a place from the ends
+    simplex_size: float = 0.02  # of a rectangle's size: first simplex about a peak
+    misfit_tolerance: float = 1e-2  # of the misfit, in units of the noise variance
+    max_evaluations: int = 60  # of the simplex search
+    curvature_step: float = 0.1  # of that simplex: step of the second difference of the misfit
     bisections: int = 6  # of the distance at which the misfit has risen
 
 
@@ -78,7 +78,7 @@ def locate_force(reconstruction: ForceReconstruction) -> ForceLocation:
         return ForceLocation(places, np.zeros(len(places)), at, std, 0.0, None)
     informative = reconstruction.informative(at)
     if isinstance(domain, Interval):
-        valleys = places[minima(reconstruction.misfits(places, informative))[: LOCALISATION.valleys]]
+        valleys = places[minima(reconstruction.misfits(places, informative))[: LOCALISATION.refined_minima]]
         # minima are compared by equal weights: each one's own would favour it
         at = min(reconstruction.workers.map(partial(_refined, reconstruction), valleys), key=reconstruction.misfit)
         informative = reconstruction.informative(at)
@@ -109,11 +109,11 @@ def _explained(reconstruction: ForceReconstruction, degrees_of_freedom: int, lef
     """
     values = 2 * sum(each.left.size for each in reconstruction.lines)
     gap = sum(each.power for each in reconstruction.lines) - values
-    if degrees_of_freedom == 0 or gap < LOCALISATION.chance * np.sqrt(2.0 * values):
+    if degrees_of_freedom == 0 or gap < LOCALISATION.noise_deviations * np.sqrt(2.0 * values):
         return 0.0, None
-    chance = LOCALISATION.chance * np.sqrt(2.0 / degrees_of_freedom)
+    chance = LOCALISATION.noise_deviations * np.sqrt(2.0 / degrees_of_freedom)
     share = float(np.clip(1.0 - left * degrees_of_freedom / gap, 0.0, 1.0))
-    return share, bool(left < LOCALISATION.noise + chance or share > 1.0 - LOCALISATION.all_but)
+    return share, bool(left < LOCALISATION.max_excess + chance or share > 1.0 - LOCALISATION.unexplained_share)
 
 
 def _refined_over(
@@ -123,21 +123,21 @@ def _refined_over(
     informative, extent = reconstruction.informative(top), np.array(rectangle.length)
 
     def inside(xy: Floats) -> tuple[float, float]:
-        x, y = np.clip(xy, LOCALISATION.edge * extent, (1.0 - LOCALISATION.edge) * extent)
+        x, y = np.clip(xy, LOCALISATION.edge_distance * extent, (1.0 - LOCALISATION.edge_distance) * extent)
         return float(x), float(y)
 
     def misfit(xy: Floats) -> float:
         return reconstruction.misfit(inside(xy), informative)
 
-    reach = LOCALISATION.near * rectangle.size
+    reach = LOCALISATION.simplex_size * rectangle.size
     options = {
         "initial_simplex": np.array(top) + reach * np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]),
-        "xatol": LOCALISATION.resolved * reach,
-        "fatol": LOCALISATION.tolerance,
-        "maxfev": LOCALISATION.evaluations,
+        "xatol": LOCALISATION.place_tolerance * reach,
+        "fatol": LOCALISATION.misfit_tolerance,
+        "maxfev": LOCALISATION.max_evaluations,
     }
     found = minimize(misfit, top, method="Nelder-Mead", options=options)
-    at, step = inside(found.x), LOCALISATION.curved_over * reach
+    at, step = inside(found.x), LOCALISATION.curvature_step * reach
     curvatures = [misfit(at + h) + misfit(at - h) - 2.0 * found.fun for h in step * np.array([(1, 0), (0, 1)])]
     flattest = max(min(curvatures), 1e-12)  # of |r|², twice the log-likelihood ratio
     return at, float(min(step * np.sqrt(2.0 / flattest), rectangle.size))
@@ -147,21 +147,21 @@ def _refined(reconstruction: ForceReconstruction, top: float) -> float:
     """The local minimum of the misfit along an interval."""
     at, informative = float(top), reconstruction.informative(top)
     length, spacing = reconstruction.domain.size, reconstruction.places[1] - reconstruction.places[0]
-    edge, beside = LOCALISATION.edge * length, RECONSTRUCTION.beside * spacing
+    edge, beside = LOCALISATION.edge_distance * length, RECONSTRUCTION.refinement_range * spacing
     for _ in range(LOCALISATION.rounds):
         how: Any = {"method": "bounded", "bounds": (max(at - beside, edge), min(at + beside, length - edge))}
-        tolerance = {"xatol": LOCALISATION.resolved * spacing}
+        tolerance = {"xatol": LOCALISATION.place_tolerance * spacing}
         found = minimize_scalar(reconstruction.misfit, args=(informative,), options=tolerance, **how)
         moved, at = abs(found.x - at), float(found.x)
         informative = reconstruction.informative(at)
-        if moved < LOCALISATION.resolved * spacing:
+        if moved < LOCALISATION.place_tolerance * spacing:
             break
     return at
 
 
 def _deviation(reconstruction: ForceReconstruction, lines: Sequence[Lines], at: float) -> float:
     """Standard error of a place along an interval, m: a quarter of that in which the misfit rises by less than 4."""
-    length, level = reconstruction.domain.size, reconstruction.misfit(at, lines) + LOCALISATION.two_sigma
+    length, level = reconstruction.domain.size, reconstruction.misfit(at, lines) + LOCALISATION.two_sigma_rise
 
     def is_outside(x: float) -> bool:
         return not 0 < x < length or reconstruction.misfit(x, lines) > level

@@ -30,21 +30,22 @@ from workbench.structure.domain import Between, Domain, Interval, Location, Name
 class ReconstructionSettings:
     """Constants of the localisation of an unmodelled force by a Kalman filter."""
 
-    levels: tuple[float, ...] = (1e-3, 1e-2, 1e-1, 1.0)  # rms of an unmodelled force over that of the inputs
-    memories: tuple[float, ...] = (10.0, 1000.0)  # its correlation time, in samples
-    most_peaks: int = 3  # of the likelihood that are kept
-    one_rate: float = 1e-6  # relative difference of the sample times of two records that are taken for one
-    places: int = 40  # of the grid along an interval
-    beside: float = 0.95  # of the grid spacing: range about a peak, or a minimum, in which it is refined
-    resolved: float = 2e-3  # of the grid spacing: tolerance of the refinement
-    still: float = 1e-6  # of the largest mode shape: a point, or a pair of points, that no force moves
-    broad: float = 0.1  # of a rectangle's diagonal: least distance between peaks
-    narrow: float = 0.03  # likewise, after refinement
-    finer: int = 5  # subdivisions of the grid of a rectangle, for the refinement
+    rms_ratios: tuple[float, ...] = (1e-3, 1e-2, 1e-1, 1.0)  # rms of an unmodelled force over that of the inputs
+    correlation_times: tuple[float, ...] = (10.0, 1000.0)  # of this force, in samples
+    max_peaks: int = 3  # of the likelihood that are kept
+    sample_time_tolerance: float = 1e-6  # relative difference of the sample times of two records that are taken for one
+    grid_places: int = 40  # of the grid along an interval
+    refinement_range: float = 0.95  # of the grid spacing: range about a peak, or a minimum, in which it is refined
+    place_tolerance: float = 2e-3  # of the grid spacing, at the refinement
+    min_motion_share: float = 1e-6  # of the largest mode shape: a point, or a pair of points, that no force moves
+    peak_spacing: float = 0.1  # of a rectangle's diagonal: least distance between peaks
+    refined_spacing: float = 0.03  # likewise, after refinement
+    subdivisions: int = 5  # of the grid of a rectangle, for the refinement
     points_tried: int = 4  # named points that are candidates
     pairs_tried: int = 12  # pairs of them, likewise
-    alike: float = 1e-4  # 1 - cos² of the angle between the mode shapes of two pairs: below, they are one place
-    many_points: int = 12  # named points up to which all are candidates
+    # 1 - cos² of the angle between the mode shapes of two pairs: below, they are one place
+    shape_tolerance: float = 1e-4
+    max_points: int = 12  # named points up to which all are candidates
 
 
 RECONSTRUCTION = ReconstructionSettings()
@@ -71,7 +72,7 @@ class ForceReconstruction:
     data: FitData
     motions: tuple[Motion, ...]
     residuals: tuple[np.ndarray, ...]
-    n_places: int = RECONSTRUCTION.places
+    n_places: int = RECONSTRUCTION.grid_places
     given_places: tuple[Location, ...] = ()
     given_size: tuple[float, float] | None = None
     workers: Workers = ALONE
@@ -82,7 +83,7 @@ class ForceReconstruction:
         cls,
         rig: Rig,
         data: FitData,
-        n_places: int = RECONSTRUCTION.places,
+        n_places: int = RECONSTRUCTION.grid_places,
         workers: Workers = ALONE,
         *,
         absorbed: bool = False,
@@ -121,7 +122,7 @@ class ForceReconstruction:
         """Of each record, s; those of clocks that agree to a millionth are one."""
         found: list[float] = []
         for dt in (record.sample_time for record in self.data.counted):
-            found.append(next((known for known in found if np.isclose(known, dt, RECONSTRUCTION.one_rate, 0.0)), dt))
+            found.append(next((t for t in found if np.isclose(t, dt, RECONSTRUCTION.sample_time_tolerance, 0.0)), dt))
         return tuple(found)
 
     @property
@@ -163,7 +164,7 @@ class ForceReconstruction:
         if isinstance(self.domain, NamedPoints):
             places: tuple[Any, ...] = (*self.domain.grid(), *self.domain.pairs())
             moved = [float(np.abs(self.rig.modes.phi_at(where)).max()) for where in places]
-            least = RECONSTRUCTION.still * max(moved)
+            least = RECONSTRUCTION.min_motion_share * max(moved)
             return tuple(where for where, size in zip(places, moved, strict=True) if size > least)
         return self.domain.grid(self._along)
 
@@ -173,7 +174,7 @@ class ForceReconstruction:
         if isinstance(self.domain, Interval):
             return [float(x) for x in self.places[::2]]
         if isinstance(self.domain, NamedPoints):
-            many = len(self.domain.names) > RECONSTRUCTION.many_points
+            many = len(self.domain.names) > RECONSTRUCTION.max_points
             return [p for p in self.peaks if not isinstance(p, Between)] if many else self.domain.grid()
         return self.domain.grid(6)
 
@@ -182,15 +183,15 @@ class ForceReconstruction:
         """Rms, N, and correlation time, in samples, of the unmodelled force: the likeliest of a coarse grid."""
         if self.given_size is not None:
             return self.given_size
-        quick, memories, rms = max(2, len(self.residuals) - 2), RECONSTRUCTION.memories, self.data.force_rms
-        sizes = [(share * rms, memory) for memory in memories for share in RECONSTRUCTION.levels]
+        quick, memories, rms = max(2, len(self.residuals) - 2), RECONSTRUCTION.correlation_times, self.data.force_rms
+        sizes = [(share * rms, memory) for memory in memories for share in RECONSTRUCTION.rms_ratios]
         # a few places, close enough to any other
         if isinstance(self.domain, Interval):
             coarse = self.places[::5]
-        elif isinstance(self.domain, NamedPoints) and len(self.domain.names) <= RECONSTRUCTION.many_points:
+        elif isinstance(self.domain, NamedPoints) and len(self.domain.names) <= RECONSTRUCTION.max_points:
             coarse = self.domain.grid()
         else:
-            coarse = self._likeliest_places[: RECONSTRUCTION.most_peaks]
+            coarse = self._likeliest_places[: RECONSTRUCTION.max_peaks]
 
         def likelihood(size: tuple[float, float]) -> float:
             return max(self._log_likelihood(x, size, quick) for x in coarse)
@@ -246,7 +247,7 @@ class ForceReconstruction:
             return self._peaks_over(self.domain, ranked)
         pairs = [i for i, where in enumerate(ranked) if isinstance(where, Between)]
         points = [i for i, where in enumerate(ranked) if not isinstance(where, Between)]
-        most = len(points) if len(points) <= RECONSTRUCTION.many_points else RECONSTRUCTION.points_tried
+        most = len(points) if len(points) <= RECONSTRUCTION.max_points else RECONSTRUCTION.points_tried
         return tuple(ranked[i] for i in sorted((*points[:most], *self._distinct_pairs(ranked, pairs))))
 
     def _distinct_pairs(self, ranked: Sequence[Any], pairs: Sequence[int]) -> list[int]:
@@ -255,7 +256,7 @@ class ForceReconstruction:
         for i in pairs:
             shape = self.rig.modes.phi_at(ranked[i])
             shape = shape / max(float(np.linalg.norm(shape)), 1e-300)
-            if all((shape @ other) ** 2 < 1.0 - RECONSTRUCTION.alike for other in kept.values()):
+            if all((shape @ other) ** 2 < 1.0 - RECONSTRUCTION.shape_tolerance for other in kept.values()):
                 kept[i] = shape
             if len(kept) == RECONSTRUCTION.pairs_tried:
                 break
@@ -268,8 +269,8 @@ class ForceReconstruction:
 
     def _peaks_over(self, rectangle: Rectangle, ranked: Sequence[Any]) -> tuple[tuple[float, float], ...]:
         """Refined peaks over a rectangle, best first; mirrored places are tried too, as a plate is nearly symmetric."""
-        (a, b), finer = rectangle.length, RECONSTRUCTION.finer
-        peaks_found = _spaced(ranked, rectangle, RECONSTRUCTION.broad)
+        (a, b), finer = rectangle.length, RECONSTRUCTION.subdivisions
+        peaks_found = _spaced(ranked, rectangle, RECONSTRUCTION.peak_spacing)
         mirrored = [image for x, y in peaks_found for image in ((x, y), (a - x, y), (x, b - y), (a - x, b - y))]
         offsets = max(a, b) / self._along * np.arange(-finer, finer + 1) / finer
         around = [
@@ -279,7 +280,7 @@ class ForceReconstruction:
         misfits = self.screened([where for places in around for where in places]).reshape(len(around), -1)
         refined = [places[int(np.argmin(row))] for places, row in zip(around, misfits, strict=True)]
         order = np.argsort(self.workers.map(self.misfit, refined), kind="stable")
-        return tuple(_spaced([refined[i] for i in order], rectangle, RECONSTRUCTION.narrow))
+        return tuple(_spaced([refined[i] for i in order], rectangle, RECONSTRUCTION.refined_spacing))
 
     @cached_property
     def peaks(self) -> tuple[Any, ...]:
@@ -288,14 +289,14 @@ class ForceReconstruction:
             return self.given_places
         if not isinstance(self.domain, Interval):
             return self._likeliest_places
-        peaks_found = self.places[minima(-self.profile)[: RECONSTRUCTION.most_peaks]]
+        peaks_found = self.places[minima(-self.profile)[: RECONSTRUCTION.max_peaks]]
         refined = self.workers.map(self._refined_peak, peaks_found)
         return tuple(at for at, _ in sorted(refined, key=lambda top: -top[1]))
 
     def _refined_peak(self, at: float) -> tuple[float, float]:
         """The peak of the log-likelihood near a place of the grid: position and height."""
         spacing = self.places[1] - self.places[0]
-        beside, options = RECONSTRUCTION.beside * spacing, {"xatol": RECONSTRUCTION.resolved * spacing}
+        beside, options = RECONSTRUCTION.refinement_range * spacing, {"xatol": RECONSTRUCTION.place_tolerance * spacing}
         how: Any = {"method": "bounded", "bounds": (at - beside, at + beside), "options": options}
         found = minimize_scalar(lambda x: -self._log_likelihood(x, self.size), **how)
         return float(found.x), -float(found.fun)
@@ -327,7 +328,7 @@ def _spaced(ranked: Sequence[tuple[float, float]], rectangle: Rectangle, share: 
     for where in ranked:
         if all(rectangle.separation(where, other) > share for other in found):
             found.append(where)
-        if len(found) == RECONSTRUCTION.most_peaks:
+        if len(found) == RECONSTRUCTION.max_peaks:
             break
     return found
 

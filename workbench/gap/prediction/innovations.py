@@ -19,9 +19,9 @@ from workbench.rig.simulate import move, prediction_errors
 from workbench.structure.domain import Interval, Location
 from workbench.structure.modes import Modes
 
-LOOSE = 0.01  # of the inputs' rms: process noise forces that set the observer gain
-DOUBLINGS = 12  # squarings of the transition matrix in the test of stability: eight are enough for most
-DIVERGED = 1e100  # squared norm of a matrix power that can be squared once more without overflow
+PROCESS_NOISE = 0.01  # of the inputs' rms: process noise forces that set the observer gain
+SQUARINGS = 12  # squarings of the transition matrix in the test of stability: eight are enough for most
+MAX_SQUARED_NORM = 1e100  # squared norm of a matrix power that can be squared once more without overflow
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,17 +48,17 @@ class Observer:
         *,
         at: Location | None = None,
         rms: float = 0.0,
-        loose: float = LOOSE,
+        process_noise: float = PROCESS_NOISE,
     ) -> "Observer":
         """The observer of a rig with sensors of noise standard deviations `noise` (n_outputs,).
 
-        force: rms of the inputs, N; at, rms: place and rms, N, of a further random force; loose: rms of the process
-        noise forces over that of the inputs: the less, the lower the gain.
+        force: rms of the inputs, N; at, rms: place and rms, N, of a further random force; process_noise: rms of the
+        forces that act as process noise, over that of the inputs: the less, the lower the gain.
         """
         modes, n = rig.modes, rig.modes.n_modes
         domain = modes.domain
         along = (np.arange(50) + 0.5) / 50 * domain.length if isinstance(domain, Interval) else domain.grid(12)
-        forces = loose * force * np.sqrt(np.mean(modes.phi(along) ** 2, axis=0))
+        forces = process_noise * force * np.sqrt(np.mean(modes.phi(along) ** 2, axis=0))
         shape = np.zeros(n) if at is None else modes.phi_at(at)
         patterns, variances = np.column_stack([np.eye(n), shape]), np.r_[forces**2, rms**2]
         gains, whitening = {}, {}
@@ -156,12 +156,12 @@ def _is_unstable(rig: Rig, gain: Floats, sample_time: float) -> bool:
 def _is_growing(step: Floats) -> bool:
     """Whether a transition matrix has an eigenvalue beyond 1."""
     power = step
-    for _ in range(DOUBLINGS):  # a power of norm below 1 proves stability, and is cheaper than eigenvalues
+    for _ in range(SQUARINGS):  # a power of norm below 1 proves stability, and is cheaper than eigenvalues
         power = power @ power
         size = float(np.einsum("ij,ij->", power, power))
         if size < 1.0:
             return False
-        if size > DIVERGED:
+        if size > MAX_SQUARED_NORM:
             break
     return bool(np.abs(np.linalg.eigvals(step)).max() > 1.0)
 

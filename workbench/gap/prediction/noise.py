@@ -21,23 +21,23 @@ from workbench.rig.simulate import simulate_record
 class NoiseSettings:
     """Constants of the estimate of a sensor's noise."""
 
-    lines: int = 20  # of the periodogram in a band, whose mean then scatters by a quarter
-    reach: int = 5  # neighbouring bands on either side
-    quiet: float = 0.25  # quantile of these bands: a quarter of them have no peaks of modes
-    lower: float = 0.67  # standard deviations by which that quantile lies below the mean
-    alike: float = 1.3  # times the power of the quietest record: residuals of two records count as equal
-    same: float = 1.1  # likewise: records that differ from it by chance alone
-    loud: float = 0.5  # of the mean square: with more of it below the peaks, these are not left out
+    band_lines: int = 20  # of the periodogram in a band, whose mean then scatters by a quarter
+    neighbour_bands: int = 5  # on either side
+    floor_quantile: float = 0.25  # of these bands: a quarter of them have no peaks of modes
+    floor_deviations: float = 0.67  # standard deviations by which that quantile lies below the mean
+    equal_power_ratio: float = 1.3  # times the power of the quietest record: residuals of two records count as equal
+    chance_power_ratio: float = 1.1  # likewise: records that differ from it by chance alone
+    floor_share: float = 0.5  # of the mean square: with more of it below the peaks, these are not left out
     # quantile of all bands: a gap's residual is least between and beyond the modes; and the ratio of this quantile to
     # the power of white noise, by the chi-square distribution of so many lines
-    least: float = 0.05
-    of_least: float = 0.66
-    louder: float = 2.0  # times the power of the quietest record: another level
-    flat: float = 0.6  # of the mean square, below the peaks: without peaks, 1400 samples have over 0.8
-    peak: float = 4.0  # times the noise floor by its neighbours: noise of 16,000 samples has no such band
-    together: float = 0.2  # correlation between two sensors: independent noise reaches 0.15 in 600 samples
-    offset: float = 4.0  # standard errors of a mean of noise
-    bands: int = 50  # that are searched for peaks, at most, so that a peak is narrower than its neighbourhood
+    quietest_quantile: float = 0.05
+    quantile_ratio: float = 0.66
+    min_level_ratio: float = 2.0  # times the power of the quietest record: another level
+    peakless_share: float = 0.6  # of the mean square, below the peaks: without peaks, 1400 samples have over 0.8
+    peak_ratio: float = 4.0  # times the noise floor by its neighbours: noise of 16,000 samples has no such band
+    max_correlation: float = 0.2  # between two sensors: independent noise reaches 0.15 in 600 samples
+    offset_deviations: float = 4.0  # standard errors of a mean of noise
+    max_bands: int = 50  # that are searched for peaks, at most, so that a peak is narrower than its neighbourhood
 
 
 NOISE = NoiseSettings()
@@ -54,10 +54,10 @@ def noise_found(residuals: Sequence[np.ndarray], coloured: np.ndarray | None = N
     whole = np.sort([(residual**2).mean(axis=1) for residual in residuals], axis=0)
     under = np.min([_power_under_peaks(residual) for residual in residuals], axis=0)
     # a residual equally strong in two records of different levels is noise of whatever colour
-    alike = whole[1] < NOISE.alike * whole[0] if len(residuals) > 1 else np.zeros(under.size, bool)
-    same = whole <= NOISE.same * whole[0]  # the quietest record itself too, if its residual is zero
+    alike = whole[1] < NOISE.equal_power_ratio * whole[0] if len(residuals) > 1 else np.zeros(under.size, bool)
+    same = whole <= NOISE.chance_power_ratio * whole[0]  # the quietest record itself too, if its residual is zero
     noise = np.where(same, whole, 0.0).sum(axis=0) / same.sum(axis=0)
-    power: Floats = np.where(alike | (under > NOISE.loud * whole[0]) | coloured, noise, under)
+    power: Floats = np.where(alike | (under > NOISE.floor_share * whole[0]) | coloured, noise, under)
     return np.sqrt(power)
 
 
@@ -76,15 +76,15 @@ def are_coloured(residuals: Sequence[np.ndarray]) -> np.ndarray:
 def _is_coloured(prewhitened: Floats) -> np.ndarray:
     """Whether a prewhitened residual (n_outputs, n_samples) is white noise, by sensor (n_outputs,)."""
     n_outputs, n_samples = prewhitened.shape
-    means = _band_means(prewhitened, max(NOISE.lines, n_samples // (2 * NOISE.bands)))
-    if means.shape[1] <= 2 * NOISE.reach or not prewhitened.any(axis=1).all():
+    means = _band_means(prewhitened, max(NOISE.band_lines, n_samples // (2 * NOISE.max_bands)))
+    if means.shape[1] <= 2 * NOISE.neighbour_bands or not prewhitened.any(axis=1).all():
         return np.zeros(n_outputs, bool)
     together = np.abs(np.corrcoef(prewhitened) - np.eye(n_outputs)).max(axis=1)
     # means of both halves, over their standard errors: an offset or a drift makes them large
     halves = np.array([half.mean(axis=1) for half in np.array_split(prewhitened, 2, axis=1)])
     apart = np.abs(halves).max(axis=0) / prewhitened.std(axis=1) * np.sqrt(n_samples / 2.0)
-    has_no_peak = (means < NOISE.peak * _noise_floor(means)).all(axis=1)
-    return np.asarray(has_no_peak & (together < NOISE.together) & (apart < NOISE.offset))
+    has_no_peak = (means < NOISE.peak_ratio * _noise_floor(means)).all(axis=1)
+    return np.asarray(has_no_peak & (together < NOISE.max_correlation) & (apart < NOISE.offset_deviations))
 
 
 def _prewhitened(residuals: Sequence[np.ndarray]) -> list[Floats]:
@@ -104,15 +104,15 @@ def is_noise_alone(
     coloured: (n_outputs,) of `are_coloured`, if known.
     """
     levels = [(record.outputs**2).mean() for record in records]
-    if max(levels) <= NOISE.louder * min(levels):
+    if max(levels) <= NOISE.min_level_ratio * min(levels):
         return False
     has_colour = bool((are_coloured(residuals) if coloured is None else coloured).all())
     # prewhitened, coloured noise has as many independent samples as white noise
     power = np.array([(left**2).mean(axis=1) for left in (_prewhitened(residuals) if has_colour else residuals)])
-    if (power.max(axis=0) >= NOISE.alike * power.min(axis=0)).any():
+    if (power.max(axis=0) >= NOISE.equal_power_ratio * power.min(axis=0)).any():
         return False
     each = zip(residuals, power, strict=True)
-    return has_colour or all((_power_under_peaks(left) > NOISE.flat * own).all() for left, own in each)
+    return has_colour or all((_power_under_peaks(left) > NOISE.peakless_share * own).all() for left, own in each)
 
 
 def noise_guessed(rig: Rig, records: Sequence[Record]) -> np.ndarray:
@@ -125,17 +125,17 @@ def noise_guessed(rig: Rig, records: Sequence[Record]) -> np.ndarray:
     """
     left = [record.outputs - simulate_record(rig, record) for record in records]
     bands = [_band_means(series) for series in (*left, *(record.outputs for record in records))]
-    least = np.min([np.quantile(means, NOISE.least, axis=1) for means in bands], axis=0)
+    least = np.min([np.quantile(means, NOISE.quietest_quantile, axis=1) for means in bands], axis=0)
     for sensor, power in zip(rig.sensors, least, strict=True):
         if not (power or sensor.noise_std):
             raise ValueError(
                 f"the records show no noise of sensor {sensor.name}, by which its residual is weighted: state its"
                 " noise_std"
             )
-    return np.asarray(np.sqrt(least / NOISE.of_least))
+    return np.asarray(np.sqrt(least / NOISE.quantile_ratio))
 
 
-def _band_means(residual: Floats, lines: int = NOISE.lines) -> Floats:
+def _band_means(residual: Floats, lines: int = NOISE.band_lines) -> Floats:
     """Means of the periodogram over bands of so many lines: (n_outputs, n_bands)."""
     n_outputs, n_samples = residual.shape
     window = np.hanning(n_samples)
@@ -153,9 +153,10 @@ def _power_under_peaks(residual: Floats) -> Floats:
 
 def _noise_floor(means: Floats) -> Floats:
     """Noise power of each band of a spectrum (n_outputs, n_bands), from the quieter of its neighbours."""
-    reach = min(NOISE.reach, (means.shape[1] - 1) // 2)
+    reach = min(NOISE.neighbour_bands, (means.shape[1] - 1) // 2)
     around = sliding_window_view(np.pad(means, ((0, 0), (reach, reach)), mode="reflect"), 2 * reach + 1, axis=1)
-    return np.asarray(np.quantile(around, NOISE.quiet, axis=2) * (1.0 + NOISE.lower / np.sqrt(NOISE.lines)))
+    below_mean = NOISE.floor_deviations / np.sqrt(NOISE.band_lines)
+    return np.asarray(np.quantile(around, NOISE.floor_quantile, axis=2) * (1.0 + below_mean))
 
 
 @dataclass(frozen=True)
@@ -163,19 +164,20 @@ class LoggedSettings:
     """Constants of the estimate of input noise (noise of the logged inputs)."""
 
     draws: int = 12  # of that noise; the loudest is what chance may cause
-    quietest: float = 1e-12  # of the power of the loudest input: variances of zero would make the filter singular
-    most: float = 0.02  # of the rms of an input: largest noise of a logger
+    # of the power of the loudest input: variances of zero would make the filter singular
+    min_power_ratio: float = 1e-12
+    max_share: float = 0.02  # of the rms of an input: largest noise of a logger
     # likewise: where this is likelier than any logger's noise, the residual of a record has another cause
-    beyond: float = 0.04
+    implausible_share: float = 0.04
     # log-likelihood over that of `LEAST_LOGGED`, nats, from which the records show input noise: for one parameter a
     # gain by chance of 6 has a probability of 5e-4
-    sure: float = 6.0
+    log_likelihood_gain: float = 6.0
 
 
 LOGGED = LoggedSettings()
 LEAST_LOGGED = 1e-3  # of the rms of an input: less noise cannot be distinguished from none
 # Shares of the inputs' rms at which the likelihood is evaluated; its maximum is interpolated.
-SHARES = tuple(LOGGED.most * 0.5**k for k in range(5))
+SHARES = tuple(LOGGED.max_share * 0.5**k for k in range(5))
 
 
 def logging_noise_power(rig: Rig, data: FitData) -> np.ndarray:
@@ -227,7 +229,7 @@ def logging_noise(by_channel: np.ndarray, sensor_noise: np.ndarray, per_unit: np
         with np.errstate(invalid="ignore"):  # the simulation may diverge
             beyond, per = by_channel[rows] - by_channel[~rows], per_unit[rows] - per_unit[~rows]
     share = np.median(np.fmax(beyond, 0.0) / np.maximum(per, 1e-300))
-    return float(min(np.sqrt(share), LOGGED.most))
+    return float(min(np.sqrt(share), LOGGED.max_share))
 
 
 def input_filters(rig: Rig, data: FitData, share: float) -> dict[str, ForceFilter]:
@@ -243,7 +245,7 @@ def input_filters(rig: Rig, data: FitData, share: float) -> dict[str, ForceFilte
     filters = {}
     for record in data.records:
         power = share**2 * (record.inputs**2).mean(axis=1)
-        variances = np.maximum(power, max(LOGGED.quietest * power.max(), 1e-300))  # none of them zero
+        variances = np.maximum(power, max(LOGGED.min_power_ratio * power.max(), 1e-300))  # none of them zero
         filters[record.name] = force_filter(models[record.sample_time], patterns, variances)
     return filters
 
@@ -264,7 +266,7 @@ class LikeliestShare(NamedTuple):
 
 def likeliest_share(rig: Rig, data: FitData, residuals: Sequence[np.ndarray]) -> LikeliestShare:
     """Input noise by maximum likelihood of the residuals (n_outputs, n_samples) of each record."""
-    by_record = np.array([_losses(rig, data, residuals, share) for share in (LOGGED.beyond, *SHARES)])
+    by_record = np.array([_losses(rig, data, residuals, share) for share in (LOGGED.implausible_share, *SHARES)])
     beyond = bool(np.median(by_record.argmin(axis=0)) < 1.0)
     losses = by_record[1:].sum(axis=1)
     best = int(np.argmin(losses))
@@ -278,7 +280,7 @@ def likeliest_share(rig: Rig, data: FitData, residuals: Sequence[np.ndarray]) ->
 def shows_input_noise(rig: Rig, data: FitData, residuals: Sequence[np.ndarray], share: float) -> bool:
     """Whether the residuals, as of `likeliest_share`, surely show input noise of a share of the inputs' rms."""
     with_noise, without = (sum(_losses(rig, data, residuals, each)) for each in (share, LEAST_LOGGED))
-    return without - with_noise > LOGGED.sure
+    return without - with_noise > LOGGED.log_likelihood_gain
 
 
 def _losses(rig: Rig, data: FitData, residuals: Sequence[np.ndarray], share: float) -> list[float]:

@@ -30,22 +30,23 @@ from workbench.structure.domain import Location, NamedPoints, same_place
 class RandomForceSettings:
     """Constants of the fit of a random force."""
 
-    sizes: tuple[float, ...] = (3e-3, 3e-2, 3e-1)  # start values of its rms, over a typical force
-    longest_memory: float = 0.9995  # pole, a sample: beyond, the force is a drift
-    first_place: float = 0.03  # of the extent: first step of the simplex along each coordinate of the place
-    first_log_rms: float = 0.5  # likewise, along the logarithm of its rms
-    first_logit: float = 0.7  # likewise, along the logit of its memory
-    tolerance: float = 1e-4  # of the simplex, in these coordinates
+    rms_ratios: tuple[float, ...] = (3e-3, 3e-2, 3e-1)  # start values of its rms, over a typical force
+    max_memory: float = 0.9995  # pole, a sample: beyond, the force is a drift
+    place_step: float = 0.03  # of the extent: first step of the simplex along each coordinate of the place
+    log_rms_step: float = 0.5  # likewise, along the logarithm of its rms
+    logit_step: float = 0.7  # likewise, along the logit of its memory
+    simplex_tolerance: float = 1e-4  # in these coordinates
     loss_tolerance: float = 0.1  # of twice the log-likelihood
-    evaluations: int = 160
-    families: int = 3  # shaping filters, likeliest first, that are fitted to two records before the best is to all
-    curved_over: float = 2e-3  # of the extent: step of the second difference of the likelihood
+    max_evaluations: int = 160
+    # shaping filters, likeliest first, that are fitted to two records before the best is to all
+    fitted_filters: int = 3
+    curvature_step: float = 2e-3  # of the extent: step of the second difference of the likelihood
     # one random force of the surroundings: largest spread of its rms between records, relative; largest deviation of
     # the mean square of the whitened residual from 1, which is 0.10 at the truth of a trial with two laws, as these act
     # on the measured motion; largest share of the force that inputs and motion predict
-    level_spread: float = 0.15
-    whitened: float = 0.15
-    follows: float = 0.1
+    max_rms_spread: float = 0.15
+    whiteness_tolerance: float = 0.15
+    max_predicted_share: float = 0.1
 
 
 RANDOM_FORCE = RandomForceSettings()
@@ -56,7 +57,7 @@ COLOURS = (
     *((memory, 3, False) for memory in (0.6, 0.85)),
     *((memory, stages, True) for stages in (2, 4) for memory in (0.1, 0.4, 0.7, 0.9)),
 )
-TONAL = 0.7  # largest share of the force's power in its mean and one sinusoid
+MAX_TONAL_SHARE = 0.7  # largest share of the force's power in its mean and one sinusoid
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +109,7 @@ class RandomForceFit:
     @property
     def holds(self) -> bool:
         """Whether the whitened residual is white and the force is random: see `is_steady`."""
-        return self.is_steady and bool(np.abs(self.chi2_by_record - 1.0).max() < RANDOM_FORCE.whitened)
+        return self.is_steady and bool(np.abs(self.chi2_by_record - 1.0).max() < RANDOM_FORCE.whiteness_tolerance)
 
     @property
     def is_steady(self) -> bool:
@@ -117,8 +118,8 @@ class RandomForceFit:
         A force that fails could be predicted. The whiteness of the residual is not tested.
         """
         spread = np.ptp(self.rms_by_record) / self.rms_by_record.mean()
-        steady = spread < RANDOM_FORCE.level_spread
-        return bool(steady and self.follows < RANDOM_FORCE.follows and self.tonal < TONAL)
+        steady = spread < RANDOM_FORCE.max_rms_spread
+        return bool(steady and self.follows < RANDOM_FORCE.max_predicted_share and self.tonal < MAX_TONAL_SHARE)
 
 
 def fit_random_force(
@@ -146,7 +147,7 @@ def fit_random_force(
 
     def loss(point: np.ndarray, family: tuple[Location, int, bool], records: list[np.ndarray]) -> float:
         is_inside = ((point[:d] >= 0.0) & (point[:d] <= 1.0)).all()
-        if not is_inside or memory_at(point) > RANDOM_FORCE.longest_memory:
+        if not is_inside or memory_at(point) > RANDOM_FORCE.max_memory:
             return 1e300
         value = -2.0 * log_likelihood(_filter(model, rig, *force_at(point, family)), records)
         return value if np.isfinite(value) else 1e300
@@ -155,17 +156,17 @@ def fit_random_force(
         (np.r_[within, np.log(size * share), np.log((memory + 1e-3) / (1.0 - memory))], (where, stages, flat))
         for where in places
         for within in [np.atleast_1d(np.asarray(where)) / extent if d else extent]
-        for share in RANDOM_FORCE.sizes
+        for share in RANDOM_FORCE.rms_ratios
         for memory, stages, flat in COLOURS
     ]
-    place, log_size, logit_of_memory = RANDOM_FORCE.first_place, RANDOM_FORCE.first_log_rms, RANDOM_FORCE.first_logit
+    place, log_size, logit_of_memory = RANDOM_FORCE.place_step, RANDOM_FORCE.log_rms_step, RANDOM_FORCE.logit_step
     steps = np.vstack([np.zeros(d + 2), np.diag(np.r_[np.full(d, place), log_size, logit_of_memory])])
 
     def refined(start: np.ndarray, family: tuple[Location, int, bool], records: list[np.ndarray], most: int) -> Any:
         inwards = np.r_[np.where(start[:d] + place > 1.0, -1.0, 1.0), 1.0, 1.0]
         options = {
             "initial_simplex": start + inwards * steps,
-            "xatol": RANDOM_FORCE.tolerance,
+            "xatol": RANDOM_FORCE.simplex_tolerance,
             "fatol": RANDOM_FORCE.loss_tolerance,
             "maxfev": most,
         }
@@ -174,13 +175,13 @@ def fit_random_force(
     likely: dict[tuple[int, bool], tuple[np.ndarray, tuple[Location, int, bool]]] = {}
     for start, family in sorted(grid, key=lambda each: loss(each[0], each[1], quick)):
         likely.setdefault(family[1:], (start, family))
-    half_evaluations = RANDOM_FORCE.evaluations // 2
+    half_evaluations = RANDOM_FORCE.max_evaluations // 2
     refined_quick = [
         (refined(first, family, quick, half_evaluations), family)
-        for first, family in list(likely.values())[: RANDOM_FORCE.families]
+        for first, family in list(likely.values())[: RANDOM_FORCE.fitted_filters]
     ]
     nearest, family = min(refined_quick, key=lambda each: float(each[0].fun))
-    found = refined(nearest.x, family, residuals, RANDOM_FORCE.evaluations)
+    found = refined(nearest.x, family, residuals, RANDOM_FORCE.max_evaluations)
     at, rms, colour = force_at(found.x, family)
     kalman = _filter(model, rig, at, rms, colour)
     n_values = sum(r.size for r in residuals)
@@ -192,7 +193,7 @@ def fit_random_force(
         at=at,
         rms=rms,
         at_std=tuple(
-            _curvature_std(lambda p: loss(p, family, residuals), found.x, i, RANDOM_FORCE.curved_over)
+            _curvature_std(lambda p: loss(p, family, residuals), found.x, i, RANDOM_FORCE.curvature_step)
             * float(extent[i])
             for i in range(d)
         ),

@@ -11,7 +11,7 @@ import numpy as np
 
 from workbench.arrays import Floats
 from workbench.deadline import NEVER, Deadline
-from workbench.gap.prediction.innovations import LOOSE, Observer
+from workbench.gap.prediction.innovations import PROCESS_NOISE, Observer
 from workbench.gap.prediction.unmodelled_force import ForceFilter, whiten
 from workbench.records.record import Record
 from workbench.rig.motion import Motion
@@ -20,7 +20,8 @@ from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped, move, steps_exactly
 from workbench.structure.modes import Modes
 
-REMEMBERED = 2  # cached motions a record: of 45,000 requests in searches, 4,400 are of the last two, 140 of older ones
+# a record: of 45,000 requests in searches, 4,400 are of the last two, 140 of older ones
+CACHED_MOTIONS = 2
 
 
 def lead_of(record: Record, transient: float) -> int:
@@ -122,14 +123,14 @@ class FitData:
         root = np.sqrt(1.0 + sizes**2)
         return replace(self, nuisance=sensitivity @ (vectors[: root.size].T / np.sqrt(root * (root + 1.0))))
 
-    def one_step_ahead(self, rig: Rig, loose: float = LOOSE) -> "FitData":
+    def one_step_ahead(self, rig: Rig, process_noise: float = PROCESS_NOISE) -> "FitData":
         """The residual of one-step-ahead predictions, with a steady-state Kalman filter of this rig.
 
-        loose: rms of process noise forces, as a share of the inputs: the less, the lower the observer gain.
+        process_noise: rms of process noise forces, as a share of the inputs: the less, the lower the observer gain.
         """
         if self.observer is not None:  # innovations with a random force are one-step-ahead errors already
             return replace(self, nuisance=None)
-        observer = Observer.of(rig, self.noise, self.force_rms, self.sample_times, loose=loose)
+        observer = Observer.of(rig, self.noise, self.force_rms, self.sample_times, process_noise=process_noise)
         return replace(self, observer=observer, whiteners={}, nuisance=None)
 
     @cached_property
@@ -160,7 +161,7 @@ class FitData:
         motion = whole.after(lead_of(record, self.transient))
         with self._lock:
             self._memory[key] = (rig.modes, motion)
-            while len(self._memory) > REMEMBERED * len(self.records):
+            while len(self._memory) > CACHED_MOTIONS * len(self.records):
                 self._memory.popitem(last=False)
         return motion
 

@@ -18,10 +18,10 @@ from workbench.rig.linear import integrated
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.modes import Modes
 
-DIVERGED = 1e100  # innovations, in any unit
+MAX_INNOVATION = 1e100  # innovations, in any unit
 WHITE = np.zeros((1, 1))  # colour of a force that is uncorrelated from sample to sample
-LEAST_FREQUENCY = 1e-4  # radians a sample: frequency given to rigid modes
-DOUBLINGS = 40  # of the number of samples of a sum or of a steady state, at most
+RIGID_FREQUENCY = 1e-4  # radians a sample: frequency given to rigid modes
+MAX_DOUBLINGS = 40  # of the number of samples of a sum or of a steady state, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ def _without_zero_frequencies(modes: Modes, sample_time: float) -> Modes:
     if modes.omega.all():
         return modes
     return replace(
-        modes, omega=np.where(modes.omega > 0, modes.omega, LEAST_FREQUENCY / sample_time), damping=modes.damping
+        modes, omega=np.where(modes.omega > 0, modes.omega, RIGID_FREQUENCY / sample_time), damping=modes.damping
     )
 
 
@@ -180,7 +180,7 @@ def _steady_state(a: np.ndarray, h: np.ndarray, q: np.ndarray, noise_variance: n
     """
     ak, gk, hk = a.T.copy(), h.T @ (h / noise_variance[:, None]), q.copy()
     eye = np.eye(a.shape[0])
-    for _ in range(DOUBLINGS):
+    for _ in range(MAX_DOUBLINGS):
         inverse = np.linalg.inv(eye + gk @ hk)
         forward = ak @ inverse
         change = ak.T @ hk @ inverse @ ak
@@ -201,7 +201,7 @@ def accumulated(a: Floats, q: Floats) -> Floats:
     A linear solution is inaccurate for badly scaled states, or several stages near a random walk.
     """
     whole, step = q, a
-    for _ in range(DOUBLINGS):
+    for _ in range(MAX_DOUBLINGS):
         more = whole + step @ whole @ step.T
         if np.array_equal(more, whole):
             break
@@ -239,7 +239,7 @@ def log_likelihood(filter_: ForceFilter, residuals: Sequence[Floats]) -> float:
     found = 0.0
     for residual in residuals:
         e = innovations(filter_, residual)
-        if not np.abs(e).max() < DIVERGED:
+        if not np.abs(e).max() < MAX_INNOVATION:
             return -np.inf
         try:
             white = _of_unit_covariance(filter_, e)

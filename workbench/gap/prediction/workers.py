@@ -24,16 +24,16 @@ from workbench.arrays import Floats
 from workbench.gap.effects.effect import Kind
 from workbench.threads import cores
 
-MOST = 8  # processes: each fork takes a hundredth of a second
-FORKS = sys.platform == "linux"  # elsewhere system libraries do not survive a fork, or there is none
+MAX_PROCESSES = 8  # each fork takes a hundredth of a second
+CAN_FORK = sys.platform == "linux"  # elsewhere system libraries do not survive a fork, or there is none
 PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
-LEFT_OVER = 5  # niceness of background work
-TURN = 4  # bytes of a number in the pipe that hands out the items
-NO_MORE = 2**32 - 1  # number that marks the end of the items
-MOST_TURNS = 8192  # numbers in the pipe at once, at most: it holds more
+BACKGROUND_NICENESS = 5
+TURN_BYTES = 4  # of a number in the pipe that hands out the items
+END_OF_TURNS = 2**32 - 1  # number that marks the end of the items
+MAX_TURNS = 8192  # numbers in the pipe at once: it holds more
 
-SPARE = 2  # arrays given back that are kept
-LARGER = 4  # largest ratio of the size of a kept array to that asked for
+SPARE_ARRAYS = 2  # given back, that are kept
+MAX_SIZE_RATIO = 4  # of the size of a kept array to that asked for
 
 _spare: dict[bool, list[Floats]] = {True: [], False: []}  # arrays given back: shared with forked processes, or not
 
@@ -57,8 +57,8 @@ class Workers:
 
     @classmethod
     def at_hand(cls) -> "Workers":
-        """One process a core, `MOST` at most."""
-        return cls(min(cores(), MOST))
+        """One process a core, `MAX_PROCESSES` at most."""
+        return cls(min(cores(), MAX_PROCESSES))
 
     def map(self, function: Callable[[Item], Found], items: Iterable[Item]) -> list[Found]:
         """`function(item)` of each item, in their order; a process that is free takes the next item.
@@ -85,7 +85,7 @@ class Workers:
         """
         if self._is_single:
             yield lambda items: [function(item) for item in items]
-        elif not FORKS:
+        elif not CAN_FORK:
             with ThreadPoolExecutor(self.number) as threads:
                 yield lambda items: list(threads.map(function, items))
         else:
@@ -97,9 +97,9 @@ class Workers:
 
     def array(self, *shape: int) -> Floats:
         """An uninitialised array that forked processes write into for this one to read."""
-        size, shared = int(np.prod(shape)), FORKS and not self._is_single
+        size, shared = int(np.prod(shape)), CAN_FORK and not self._is_single
         spare = _spare[shared]
-        i = next((i for i, room in enumerate(spare) if size <= room.size <= LARGER * size), None)
+        i = next((i for i, room in enumerate(spare) if size <= room.size <= MAX_SIZE_RATIO * size), None)
         if i is not None:
             room = spare.pop(i)
         elif shared:
@@ -111,8 +111,8 @@ class Workers:
     def give_back(self, array: Floats) -> None:
         """Keep the memory for the next `array`: the system takes a microsecond to clear each kilobyte of new memory."""
         if isinstance(array.base, np.ndarray):
-            spare = _spare[FORKS and not self._is_single]
-            spare[:] = [array.base, *spare[: SPARE - 1]]
+            spare = _spare[CAN_FORK and not self._is_single]
+            spare[:] = [array.base, *spare[: SPARE_ARRAYS - 1]]
 
     @property
     def at_once(self) -> int:
@@ -130,7 +130,7 @@ class Workers:
         The background process may have processes of its own. Without forks, the result is computed when asked for. A
         result not asked for by the end of the block is discarded. The block ends all processes and frees their memory.
         """
-        child = None if self._is_single or not FORKS else _Child(lambda _: function(), background=True)
+        child = None if self._is_single or not CAN_FORK else _Child(lambda _: function(), background=True)
         try:
             if child is not None:
                 child.ask(None)
@@ -167,7 +167,7 @@ class _Pool:
         for child in self._children:
             child.ask(items)
         for _ in range(len(self._children) + 1):
-            self._put(NO_MORE)
+            self._put(END_OF_TURNS)
         found = self._compute_turns(items)
         for child in self._children:
             found.update(child.found())
@@ -180,12 +180,12 @@ class _Pool:
             child.end()
 
     def _put(self, turn: int) -> None:
-        os.write(self._sink, turn.to_bytes(TURN, "little"))
+        os.write(self._sink, turn.to_bytes(TURN_BYTES, "little"))
 
     def _compute_turns(self, items: Sequence[Any]) -> dict[int, Any]:
         """The results of this process, by index of the item."""
         found, per_turn = {}, _per_turn(items)
-        while (start := int.from_bytes(os.read(self._turns, TURN), "little")) != NO_MORE:
+        while (start := int.from_bytes(os.read(self._turns, TURN_BYTES), "little")) != END_OF_TURNS:
             for i in range(start, min(start + per_turn, len(items))):
                 found[i] = self._function(items[i])
         return found
@@ -193,7 +193,7 @@ class _Pool:
 
 def _per_turn(items: Sequence[Any]) -> int:
     """Number of items that are taken at once."""
-    return -(-len(items) // MOST_TURNS)
+    return -(-len(items) // MAX_TURNS)
 
 
 class _Child:
@@ -248,7 +248,7 @@ def _serve(work: Callable[[Any], Any], there: Connection, background: bool) -> N
     try:
         _Child.is_this_process = not background
         _spare[True].clear()  # shared memory belongs to the parent
-        os.nice(LEFT_OVER if background else 0)
+        os.nice(BACKGROUND_NICENESS if background else 0)
         CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # the child dies with its parent
         while True:
             asked = _received(there.recv_bytes())

@@ -14,7 +14,7 @@ from workbench.gap.localisation.force_reconstruction import ForceReconstruction
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import Workers
 from workbench.gap.search.fit import Fit
-from workbench.gap.setup.record_checks import LEAST_SAMPLES
+from workbench.gap.setup.record_checks import MIN_SAMPLES
 from workbench.records.record import Record
 from workbench.renamed import Renamed
 from workbench.rig.rig import Rig
@@ -182,7 +182,7 @@ def next_experiment(rig: Rig, best: Fit, alternative: Fit, data: FitData, worker
         rate = _separation(rig, best, alternative, replace(data, records=(varied,)))
         if not rate * LONGEST * record.n_samples * record.sample_time > DETECTABLE:
             return Experiment("", (), 1.0, np.inf, names)
-        seconds = max(DETECTABLE / rate, LEAST_SAMPLES * record.sample_time, *PERIODS / elastic[:1])
+        seconds = max(DETECTABLE / rate, MIN_SAMPLES * record.sample_time, *PERIODS / elastic[:1])
         return Experiment(record.name, inputs, level, float(seconds), names)
 
     choices = []

@@ -101,13 +101,13 @@ def steady_remainder(rig: Rig, records: Sequence[Record], *, transient: float = 
         level = np.sqrt(np.mean(record.inputs**2))
         lead = lead_of(record, transient)
         power = (((record.outputs - simulate_record(rig, record))[:, lead:] / noise) ** 2).mean(axis=0)
-        if level > 0 and power.mean() > (1.0 + BREAKDOWN.clear) ** 2:
+        if level > 0 and power.mean() > (1.0 + BREAKDOWN.noise_margin) ** 2:
             blocks = np.array_split(power, power.size // block_length(rig, power.size, record.sample_time))
             means = np.array([block.mean() for block in blocks])
             scatter = means.std(ddof=1) / np.sqrt(means.size)
             by_level.append((level, power.mean() - 1.0, scatter / (power.mean() - 1.0), record.name))
     by_level.sort()
-    if len(by_level) < 2 or by_level[-1][0] < BREAKDOWN.louder * by_level[0][0]:
+    if len(by_level) < 2 or by_level[-1][0] < BREAKDOWN.level_ratio * by_level[0][0]:
         return None
     levels, powers, scatters = np.array([each[:3] for each in by_level]).T
     weights = 4.0 / scatters**2  # inverse variances of the logarithm of the rms

@@ -325,8 +325,8 @@ def by_continuation(search: Search, effects: tuple[Effect, ...], iterations: int
     """
     rig = apply_all(search.rig, effects)
     if is_stepped(rig) and not search.held and search.data.observer is None:
-        for loose in SELECTION.continuation:
-            data = search.data.one_step_ahead(rig, loose).finely(SELECTION.substeps)
+        for process_noise in SELECTION.continuation:
+            data = search.data.one_step_ahead(rig, process_noise).finely(SELECTION.substeps)
             held = fit(search.rig, effects, data, iterations=8, tolerance=1e-4)
             effects = held.effects
             if (

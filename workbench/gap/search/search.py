@@ -11,7 +11,7 @@ import numpy as np
 from workbench.gap.effects.effect import Effect, Kind, apply_all, can_be
 from workbench.gap.effects.nominal import STIFFNESS, NominalPrior
 from workbench.gap.localisation.force_reconstruction import FEWER_PLACES, ForceReconstruction
-from workbench.gap.prediction.innovations import LOOSE, Observer
+from workbench.gap.prediction.innovations import PROCESS_NOISE, Observer
 from workbench.gap.prediction.noise import input_filters, logging_noise_power, noise_found
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
@@ -47,7 +47,7 @@ class Search:
         by_mode: whether nominal errors are those of each mode (its frequency, its shape at every transducer) instead of
             smooth variations of mass and stiffness.
         tolerance: of the signal's rms: neither a gap nor an effect that is smaller in every record counts.
-        loose: process noise of the observer that predicts one step ahead, of the inputs' rms.
+        process_noise: process noise of the observer that predicts one step ahead, of the inputs' rms.
     """
 
     rig: Rig
@@ -63,7 +63,7 @@ class Search:
     differs: str = ""
     by_mode: bool = False
     tolerance: float = 0.0
-    loose: float = LOOSE
+    process_noise: float = PROCESS_NOISE
 
     @property
     def is_over(self) -> bool:
@@ -273,7 +273,7 @@ class Search:
         return cost_of(self.rig, self.held, self.ahead)
 
     def _ahead(self, data: FitData) -> FitData:
-        data = data.one_step_ahead(self.rig, self.loose)
+        data = data.one_step_ahead(self.rig, self.process_noise)
         if not self.held or finite_residual(self.rig, self.held, data) is None:  # the predictions diverge
             return data
         return data.with_nuisance(sensitivity(self.rig, self.held, data, self.workers))

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from workbench.gap.prediction.innovations import LOOSE
+from workbench.gap.prediction.innovations import PROCESS_NOISE
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class SelectionSettings:
     max_residual_ahead: float = 5.0
     max_share_ahead: float = 0.05
     # process noise of the observers of a continuation, one after the other: the smaller, the lower the observer gain
-    continuation: tuple[float, ...] = (LOOSE, 0.1 * LOOSE, 0.01 * LOOSE)
+    continuation: tuple[float, ...] = (PROCESS_NOISE, 0.1 * PROCESS_NOISE, 0.01 * PROCESS_NOISE)
     convergence_residual: float = 10.0  # times the noise power on whole records: from there, a fit to them converges
     first_iterations: int = 5  # iterations on whole records before the best fits are chosen
 

@@ -531,10 +531,10 @@ class Stepwise:
         # the residual beyond nominal errors fitted to whole records is evidence of a missing effect
         with_errors = search.with_nominal_errors(step.errors)
         cost = cost_of(search.rig, step.fit.effects, with_errors.ahead)
-        for loose in SELECTION.continuation[1:]:  # what grows slowly hides in the noise one step ahead
+        for process_noise in SELECTION.continuation[1:]:  # what grows slowly hides in the noise one step ahead
             if cost > 1.0 + STEPWISE.noise_excess or step.explains:
                 break
-            with_errors = replace(with_errors, loose=loose)
+            with_errors = replace(with_errors, process_noise=process_noise)
             cost = cost_of(search.rig, step.fit.effects, with_errors.ahead)
         rig = apply_all(search.rig, step.fit.effects)
         reconstruction = ForceReconstruction.of(rig, search.data, workers=search.workers, absorbed=True)

@@ -12,7 +12,14 @@ from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.effects.nominal import NominalPrior
 from workbench.gap.localisation.force_reconstruction import ForceReconstruction
 from workbench.gap.prediction.innovations import Observer
-from workbench.gap.prediction.random_force import TONAL, RandomForceFit, fit_random_force, followed, model_filter, tonal
+from workbench.gap.prediction.random_force import (
+    MAX_TONAL_SHARE,
+    RandomForceFit,
+    fit_random_force,
+    followed,
+    model_filter,
+    tonal,
+)
 from workbench.gap.search.finish import finished, plainest, ranked, simplest
 from workbench.gap.search.fit import Fit, cost_of, fit, parameters_of
 from workbench.gap.search.jointly import JointFit, fit_jointly
@@ -42,7 +49,7 @@ class WithRandom(NamedTuple):
 
     def is_near(self, search: Search) -> bool:
         """Whether the whitened residual is small, and the force no tone, so that a further effect may be missing."""
-        return search.near(self.fit, RANDOM.max_residual_share) and not self.random.tonal > TONAL
+        return search.near(self.fit, RANDOM.max_residual_share) and not self.random.tonal > MAX_TONAL_SHARE
 
 
 def looks_random(reconstruction: ForceReconstruction) -> bool:
@@ -59,7 +66,7 @@ def looks_random(reconstruction: ForceReconstruction) -> bool:
     levels = np.array([_rms_above(slowest, force, records[0].sample_time) for force in forces])
     if len(forces) < 2 or np.ptp(levels) > RANDOM.max_rms_spread * levels.mean():
         return False
-    if min(tonal(force, records[0].sample_time) for force in forces) > TONAL:
+    if min(tonal(force, records[0].sample_time) for force in forces) > MAX_TONAL_SHARE:
         return False
     shape = reconstruction.rig.modes.phi_at(place.at)
     motions = [shape @ np.array([motion.displacement, motion.velocity]) for motion in reconstruction.motions]

@@ -13,7 +13,14 @@ from typing import Any
 import numpy as np
 
 from workbench.arrays import Flags, Floats
-from workbench.gap.setup.comparison import AFFECTED, CLOSED, MOST_CHANNELS, Comparison, band_misfit, compared_bands
+from workbench.gap.setup.comparison import (
+    MAX_INPUTS,
+    MIN_CLOSED_SHARE,
+    MIN_MISFIT_CHANGE,
+    Comparison,
+    band_misfit,
+    compared_bands,
+)
 from workbench.gap.setup.corrections import (
     FACTORS,
     TURN,
@@ -32,25 +39,28 @@ from workbench.gap.setup.corrections import (
 )
 
 # decrease of the mean misfit over affected bands: a factor of 1.8 or more has it, and a wrong sign has 2
-LEAST_DECREASE = 0.4
-UNCORRELATED = 0.9  # largest mean misfit that may remain there: uncorrelated signals have at least 1
-LEAST_SHARE = 0.5  # of the mean misfit there, which must go: the changes by a missing effect stay
-LEAST_BANDS = 0.8  # share of these bands in which the misfit must decrease
+MIN_DECREASE = 0.4
+MAX_MISFIT_LEFT = 0.9  # mean misfit that may remain there: uncorrelated signals have at least 1
+MIN_REMOVED_SHARE = 0.5  # of the mean misfit there, which must go: the changes by a missing effect stay
+MIN_BAND_SHARE = 0.8  # share of these bands in which the misfit must decrease
 # mean misfit by which it must be better than any alternative, where they differ: 2π and 9.81 differ by 0.44
-MARGIN = 0.25
-LEAST_DIFFERING = 0.1  # share of the affected bands in which it must differ from any alternative
+MISFIT_MARGIN = 0.25
+MIN_DIFFERING_SHARE = 0.1  # share of the affected bands in which it must differ from any alternative
 QUANTITIES = ("displacement", "velocity", "acceleration")
-NEAR = 0.15  # largest relative difference of a gain from a factor near it: the smallest ratio of two factors is 1.56
+# largest relative difference of a gain from a factor near it: the smallest ratio of two factors is 1.56
+FACTOR_TOLERANCE = 0.15
 # of a factor's logarithm: largest difference of the log gains of two records (2π: a factor 1.2 between them)
-SAME_GAIN = 0.1
+LOG_GAIN_TOLERANCE = 0.1
 # an error of calibration removes a larger share of the residual power beyond the noise that the factor leaves
 GAIN_SHARE = 0.5
 GAIN_CHI2 = 25.0  # and differs from the factor by five standard errors, in white noise
-CALIBRATED = 1e-3  # relative: a gain closer to a factor is that factor (9.81 for 9.80665 is 3.4e-4)
-AMBIGUOUS = (G, 1.0 / G, TURN, 1.0 / TURN)  # factors that a wrong calibration may reach; others are too far from one
-OF_MEDIAN = 1.858  # standard error of a median by the median absolute deviation and the root of the number, if normal
-NEAREST = 0.22  # of the logarithm of a gain: half the smallest ratio of two factors
-NEAR_TEN = 0.01  # relative: if all gains are as near to 10, an amplifier is as likely as g, which differs by 2 %
+GAIN_TOLERANCE = 1e-3  # relative: a gain closer to a factor is that factor (9.81 for 9.80665 is 3.4e-4)
+# factors that a wrong calibration may reach; others are too far from one
+AMBIGUOUS_FACTORS = (G, 1.0 / G, TURN, 1.0 / TURN)
+# standard error of a median by the median absolute deviation and the root of the number, if normal
+MEDIAN_ERROR_RATIO = 1.858
+MAX_LOG_DISTANCE = 0.22  # of the logarithm of a gain: half the smallest ratio of two factors
+TEN_TOLERANCE = 0.01  # relative: if all gains are as near to 10, an amplifier is as likely as g, which differs by 2 %
 
 
 def channel_faults(gap: Comparison, kinds: Collection[str]) -> list[SetupFault]:
@@ -97,21 +107,21 @@ def accepted(gap: Comparison) -> list[Candidate]:
     better = [candidate for candidate in _candidates(gap) if candidate.misfit[compared].sum() < before.sum()]
     better.sort(key=lambda candidate: float(candidate.misfit[compared].sum()))
     after = np.array([candidate.misfit[compared] for candidate in better]).reshape(-1, before.size)
-    affected = np.abs(after - before) > AFFECTED
+    affected = np.abs(after - before) > MIN_MISFIT_CHANGE
     chosen = []
     for i, candidate in enumerate(better):
         at = affected[i]
         if not at.any():
             continue
         decrease = (before - after[i])[at]
-        least = max(LEAST_DECREASE, LEAST_SHARE * before[at].mean(), before[at].mean() - UNCORRELATED)
-        if decrease.mean() < least or (decrease > 0).mean() < LEAST_BANDS:
+        least = max(MIN_DECREASE, MIN_REMOVED_SHARE * before[at].mean(), before[at].mean() - MAX_MISFIT_LEFT)
+        if decrease.mean() < least or (decrease > 0).mean() < MIN_BAND_SHARE:
             continue
         alternatives = affected[:, at].mean(axis=1) >= 0.5
         alternatives[i] = False
-        differs = np.abs(after[alternatives] - after[i]) > AFFECTED
+        differs = np.abs(after[alternatives] - after[i]) > MIN_MISFIT_CHANGE
         margin = np.where(differs, after[alternatives] - after[i], 0.0).sum(axis=1)
-        if (margin > MARGIN * np.maximum(differs.sum(axis=1), LEAST_DIFFERING * at.sum())).all():
+        if (margin > MISFIT_MARGIN * np.maximum(differs.sum(axis=1), MIN_DIFFERING_SHARE * at.sum())).all():
             chosen.append(candidate)
     return chosen
 
@@ -144,7 +154,7 @@ def _candidates(gap: Comparison) -> Iterator[Candidate]:
             yield Candidate("inputs", factor, (p,), band_misfit(measured, simulated.with_lines(lines)))
     m = len(rig.actuators)
     for p, q in combinations(range(m), 2):
-        if m <= MOST_CHANNELS or q == p + 1:
+        if m <= MAX_INPUTS or q == p + 1:
             names = rig.actuators[p].name, rig.actuators[q].name
             crossed = gap.spectra_of(gap.simulated_with(*exchanged("inputs", *names, rig, gap.records)))
             yield Candidate("exchanged inputs", names, (p, q), band_misfit(measured, crossed))
@@ -166,10 +176,10 @@ def output_in_other_unit(gap: Comparison) -> list[SetupFault]:
         beside = own[at] - np.nanmedian(others[at], axis=1)
         factor = min((f for f in FACTORS if f > 0), key=lambda f: abs(np.median(beside) - np.log(f)))
         off = beside - np.log(factor)
-        error = GAIN_CHI2**0.5 * OF_MEDIAN * np.median(np.abs(off - np.median(off))) / np.sqrt(off.size)
+        error = GAIN_CHI2**0.5 * MEDIAN_ERROR_RATIO * np.median(np.abs(off - np.median(off))) / np.sqrt(off.size)
         from_ten = abs(abs(np.median(beside)) - np.log(10.0))
-        is_calibrated = factor not in AMBIGUOUS or abs(np.median(off)) < max(error, CALIBRATED) < from_ten
-        if (np.abs(off) < NEAREST).all() and is_calibrated:
+        is_calibrated = factor not in AMBIGUOUS_FACTORS or abs(np.median(off)) < max(error, GAIN_TOLERANCE) < from_ten
+        if (np.abs(off) < MAX_LOG_DISTANCE).all() and is_calibrated:
             found.append(_fault(gap, "outputs", factor, (int(j),), True))
     return found if len(found) == 1 else []
 
@@ -178,21 +188,21 @@ def _is_certain(gap: Comparison, candidate: Candidate) -> bool | None:
     """Whether a fault is certain; False if its factor may be an error of calibration, None if that is undecidable."""
     if candidate.value == 0.0:
         return None
-    affected = np.abs(candidate.misfit - gap.misfit) > AFFECTED
+    affected = np.abs(candidate.misfit - gap.misfit) > MIN_MISFIT_CHANGE
     if candidate.kind in ("outputs", "inputs") and _rests_on_one_mode(gap, candidate.value, affected):
         return None
-    if candidate.value not in AMBIGUOUS:
+    if candidate.value not in AMBIGUOUS_FACTORS:
         return True
     if candidate.kind == "inputs":  # `scaled_inputs` tests them jointly
         return None
     n, factor = gap.n_samples, float(candidate.value)
     if len(candidate.at) > 1:
-        return bool((np.abs(gap.gains / (10.0 if factor > 1.0 else 0.1) - 1.0) > NEAR_TEN).any())
+        return bool((np.abs(gap.gains / (10.0 if factor > 1.0 else 0.1) - 1.0) > TEN_TOLERANCE).any())
     (j,) = candidate.at
     if candidate.value in (G, 1.0 / G) and gap.rig.sensors[j].quantity != "acceleration":
         return None
     with_factor, with_gain = (gap.residual_power([g * p for p in gap.simulated]) for g in (factor, gap.gains[:, None]))
-    if gap.closed(with_factor)[j] < CLOSED:
+    if gap.closed(with_factor)[j] < MIN_CLOSED_SHARE:
         return None
     sums = n * with_factor[j], n * with_gain[j], n * gap.noise[j]
     return not is_calibration_error(float(gap.gains[j]), factor, *sums, n)
@@ -205,7 +215,7 @@ def _rests_on_one_mode(gap: Comparison, factor: float, affected: Flags | bool) -
     gives it any gain. affected: (n_records, n_outputs, n_modes) bands whose misfit the correction changes.
     """
     n = int((compared_bands(gap.measured_spectra) & affected).any(axis=(0, 1)).sum())
-    return factor in (-1.0, *AMBIGUOUS) and n < min(2, gap.rig.modes.n_modes)
+    return factor in (-1.0, *AMBIGUOUS_FACTORS) and n < min(2, gap.rig.modes.n_modes)
 
 
 def _fault(gap: Comparison, kind: str, value: Any, at: Sequence[int], certain: bool) -> SetupFault:
@@ -253,7 +263,7 @@ def scaled_inputs(gap: Comparison) -> list[SetupFault]:
     gains = np.ones(len(rig.actuators))
     gains[acting] = np.linalg.lstsq(matrix[:, acting] / sizes[acting], target, rcond=1e-6)[0] / sizes[acting]
     factors = {p: factor_near(gains[p]) for p in acting}
-    if any(factors[p] is None and abs(gains[p] - 1.0) > NEAR for p in acting):
+    if any(factors[p] is None and abs(gains[p] - 1.0) > FACTOR_TOLERANCE for p in acting):
         return []
     wrong = {p: factor for p, factor in factors.items() if factor is not None}
     if any(_rests_on_one_mode(gap, factor, True) for factor in wrong.values()):
@@ -262,7 +272,7 @@ def scaled_inputs(gap: Comparison) -> list[SetupFault]:
         return []
     correction = partial(inputs_times, {rig.actuators[p].name: factor for p, factor in wrong.items()})
     closes = gap.closes(*correction(rig, gap.records))
-    if closes < CLOSED:
+    if closes < MIN_CLOSED_SHARE:
         return []
 
     def chi_squared(gains: Floats) -> float:
@@ -286,7 +296,7 @@ def scaled_inputs(gap: Comparison) -> list[SetupFault]:
 
 def factor_near(gain: float) -> float | None:
     """The factor of `FACTORS` nearest to a gain; None if none is near."""
-    near = [factor for factor in FACTORS if gain * factor > 0 and abs(gain / factor - 1.0) < NEAR]
+    near = [factor for factor in FACTORS if gain * factor > 0 and abs(gain / factor - 1.0) < FACTOR_TOLERANCE]
     return min(near, key=lambda factor: abs(gain / factor - 1.0), default=None)
 
 
@@ -297,7 +307,7 @@ def is_calibration_error(
 
     with_factor, with_gain, noise: sums of squares of both residuals and of the noise, over `n_samples`.
     """
-    if factor not in AMBIGUOUS or abs(gain / factor - 1.0) < CALIBRATED:
+    if factor not in AMBIGUOUS_FACTORS or abs(gain / factor - 1.0) < GAIN_TOLERANCE:
         return False
     removed = with_factor - with_gain
     return bool(removed > GAIN_SHARE * (with_factor - noise) and removed * n_samples > GAIN_CHI2 * with_gain)
@@ -326,7 +336,7 @@ def _with_doubt_by_record(gap: Comparison, fault: SetupFault) -> SetupFault:
 def log_gains_after(gap: Comparison, fault: SetupFault) -> Floats:
     """Log gains (n_records, n_outputs, n_modes) after a correction; NaN in bands that it does not affect."""
     after = gap.corrected(fault.correction).log_ratios
-    return np.where(np.abs(after - gap.log_ratios) > AFFECTED, after, np.nan)
+    return np.where(np.abs(after - gap.log_ratios) > MIN_MISFIT_CHANGE, after, np.nan)
 
 
 def largest_difference(log_gains: Iterable[Floats]) -> float:
@@ -337,4 +347,4 @@ def largest_difference(log_gains: Iterable[Floats]) -> float:
 
 def tolerated_difference(fault: SetupFault) -> float:
     """Difference of the log gains of two records that a fault allows; infinite if it is not one of units."""
-    return SAME_GAIN * abs(np.log(fault.factor)) if fault.factor != 1.0 else np.inf
+    return LOG_GAIN_TOLERANCE * abs(np.log(fault.factor)) if fault.factor != 1.0 else np.inf

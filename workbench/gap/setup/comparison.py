@@ -13,17 +13,19 @@ from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped, simulate_record
 
-LEAST_POWER = 1e-2  # of a channel's power: a band with less holds noise and leakage, and is not compared
-LARGEST_LOG_RATIO = 3.0  # bound of |log amplitude ratio|, so that one band that an effect changes does not dominate
-FADE = 0.25  # of a record: its end is faded out over it; its beginning, from rest, holds the response to a hammer
+MIN_POWER_SHARE = 1e-2  # of a channel's power: a band with less holds noise and leakage, and is not compared
+MAX_LOG_RATIO = 3.0  # bound of |log amplitude ratio|, so that one band that an effect changes does not dominate
+# of a record: its end is faded out over it; its beginning, from rest, holds the response to a hammer
+FADED_SHARE = 0.25
 # rms residual, in standard deviations of the channel, from which it may be connected wrongly: a wrong sign leaves 2, an
 # exchange about 1.4, a factor of 2π at least 0.84
-WIDE_GAP = 0.3
-LARGEST_LEFT = 0.15  # share of a channel's measured power that may remain beyond the noise: zero simulations leave all
-NOISY = 0.5  # share of noise in a channel's measured power from which it shows no fault
-CLOSED = 0.9  # share of the closable power that a correction must remove, on the channels that it concerns
-AFFECTED = 0.2  # change of the misfit from which a correction affects a band
-MOST_CHANNELS = 12  # inputs that are simulated one by one, and exchanged in pairs; beyond, only neighbours are
+MIN_RESIDUAL = 0.3
+# share of a channel's measured power that may remain beyond the noise: zero simulations leave all
+MAX_RESIDUAL_SHARE = 0.15
+MAX_NOISE_SHARE = 0.5  # share of noise in a channel's measured power from which it shows no fault
+MIN_CLOSED_SHARE = 0.9  # share of the closable power that a correction must remove, on the channels that it concerns
+MIN_MISFIT_CHANGE = 0.2  # change of the misfit from which a correction affects a band
+MAX_INPUTS = 12  # inputs that are simulated one by one, and exchanged in pairs; beyond, only neighbours are
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +48,7 @@ class Spectra:
         lines, edges = [], []
         for signal, record in zip(signals, records, strict=True):
             n = signal.shape[1]
-            fade = np.minimum(1.0, np.arange(n, 0, -1) / (FADE * n))
+            fade = np.minimum(1.0, np.arange(n, 0, -1) / (FADED_SHARE * n))
             lines.append(np.fft.rfft((signal - signal.mean(axis=1, keepdims=True)) * np.sin(0.5 * np.pi * fade) ** 2))
             edges.append(np.asarray(np.searchsorted(np.fft.rfftfreq(n, record.sample_time), edges_hz)))
         return Spectra(lines, edges)
@@ -74,7 +76,7 @@ class Spectra:
 
 def compared_bands(measured: Spectra) -> Flags:
     """Whether each band (n_records, n_signals, n_modes) holds enough of its signal to be compared."""
-    return np.asarray(measured.power > LEAST_POWER * measured.power.sum(axis=2, keepdims=True))
+    return np.asarray(measured.power > MIN_POWER_SHARE * measured.power.sum(axis=2, keepdims=True))
 
 
 def band_misfit(measured: Spectra, simulated: Spectra, factor: float = 1.0) -> Floats:
@@ -87,8 +89,8 @@ def band_misfit(measured: Spectra, simulated: Spectra, factor: float = 1.0) -> F
         of_y, of_p, both = measured.power, simulated.power, measured.cross_power(simulated)
         ratio = 0.5 * (np.log(np.maximum(of_y, 1e-300)) - np.log(np.maximum(of_p * factor**2, 1e-300)))
         correlation = np.sign(factor) * both / np.sqrt(np.maximum(of_y * of_p, 1e-300))
-        misfit = np.minimum(np.abs(ratio), LARGEST_LOG_RATIO) + 1.0 - correlation
-        return np.asarray(np.nan_to_num(misfit, nan=LARGEST_LOG_RATIO + 1.0))
+        misfit = np.minimum(np.abs(ratio), MAX_LOG_RATIO) + 1.0 - correlation
+        return np.asarray(np.nan_to_num(misfit, nan=MAX_LOG_RATIO + 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +152,7 @@ class Comparison:
     def by_input(self) -> list[list[Floats]]:
         """Predictions of a linear rig for each input alone; empty for one input, too many, or a nonlinear rig."""
         m = len(self.rig.actuators)
-        if not 1 < m <= MOST_CHANNELS or is_stepped(self.rig):
+        if not 1 < m <= MAX_INPUTS or is_stepped(self.rig):
             return []
         alone = [[replace(r, inputs=r.inputs * (np.arange(m) == p)[:, None]) for r in self.records] for p in range(m)]
         return [self.simulated_with(self.rig, records) for records in alone]
@@ -168,7 +170,7 @@ class Comparison:
     def wide(self) -> Flags:
         """Whether the residual of each output (n_outputs,) is too large for an effect; False for a constant channel."""
         moves = np.any([np.ptp(y, axis=1) > 0 for y in self.measured], axis=0)
-        return np.asarray(moves & (self.before > np.maximum(WIDE_GAP**2, 4.0 * self.noise)))
+        return np.asarray(moves & (self.before > np.maximum(MIN_RESIDUAL**2, 4.0 * self.noise)))
 
     @cached_property
     def measured_spectra(self) -> Spectra:
@@ -231,7 +233,7 @@ class Comparison:
         """
         left = np.maximum(after - self.noise, 0.0)
         closed = 1.0 - left / np.maximum(self.before - self.noise, 1e-300)
-        return np.where((left > LARGEST_LEFT) | (self.noise > NOISY), 0.0, closed)
+        return np.where((left > MAX_RESIDUAL_SHARE) | (self.noise > MAX_NOISE_SHARE), 0.0, closed)
 
     def closes(self, rig: Rig, records: Sequence[Record]) -> float:
         """The share that a corrected rig and records close: the median over channels with a wide gap."""

@@ -16,7 +16,7 @@ from workbench.gap.setup.channels import (
     scaled_inputs,
     tolerated_difference,
 )
-from workbench.gap.setup.comparison import AFFECTED, CLOSED, Comparison, compared_bands
+from workbench.gap.setup.comparison import MIN_CLOSED_SHARE, MIN_MISFIT_CHANGE, Comparison, compared_bands
 from workbench.gap.setup.corrections import SetupFault, records_alone, without_faults
 from workbench.gap.setup.records import check_names, copied_channels, repeated
 from workbench.gap.setup.sampling import late_records, modal_units, sampling_rates
@@ -25,7 +25,7 @@ from workbench.rig.rig import Rig
 
 Detector = Callable[[Comparison], list[SetupFault]]
 
-MOST_ROUNDS = 4  # faults that mask one another are detected one after the other
+MAX_ROUNDS = 4  # faults that mask one another are detected one after the other
 BY_RECORD = ("exchanged inputs", "exchanged outputs", "sign", "unit")  # kinds of faults that some records may not have
 CANDIDATES = ("outputs", "inputs", "exchanged outputs", "exchanged inputs")  # of channels, that one record may have
 OF_ONE_RECORD: tuple[Detector, ...] = (partial(channel_faults, kinds=CANDIDATES), scaled_inputs, sampling_rates)
@@ -76,7 +76,7 @@ def setup_faults(
         found += [
             _for_one_record(what, gap.records[0], fault)
             for fault in _in_rounds(gap, OF_ONE_RECORD)
-            if fault.certain and fault.closes >= CLOSED and _is_of_one_record(fault, gap, others)
+            if fault.certain and fault.closes >= MIN_CLOSED_SHARE and _is_of_one_record(fault, gap, others)
         ]
     return tuple(found)
 
@@ -92,7 +92,7 @@ def exchanges(faults: Iterable[SetupFault], records: Sequence[Record]) -> tuple[
 def _in_rounds(gap: Comparison, detectors: Sequence[Detector]) -> list[SetupFault]:
     """All faults, in rounds: those of one kind are corrected before the next round, since they may mask others."""
     found: list[SetupFault] = []
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         faults = _best(gap, detectors)
         found += faults
         if not any(fault.certain for fault in faults):
@@ -130,7 +130,7 @@ def _worsened(gaps: Sequence[Comparison], fault: SetupFault) -> list[Comparison]
     def misfit(gap: Comparison) -> float:
         return float(gap.misfit[compared_bands(gap.measured_spectra)].sum())
 
-    return [gap for gap in gaps if misfit(gap.corrected(fault.correction)) > misfit(gap) + AFFECTED]
+    return [gap for gap in gaps if misfit(gap.corrected(fault.correction)) > misfit(gap) + MIN_MISFIT_CHANGE]
 
 
 def _for_agreeing_records(gaps: Sequence[Comparison], fault: SetupFault) -> SetupFault:

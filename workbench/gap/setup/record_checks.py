@@ -16,20 +16,20 @@ from workbench.structure.modes import Modes
 from workbench.structure.plate import Membrane, Plate
 from workbench.structure.supports import PointMass
 
-WRONG_SIGN = -0.95  # correlation of a reading with the prediction
-WRONG_UNIT = 50.0  # ratio of a reading and the prediction, or its inverse
-NO_EFFECT = 500.0  # times smaller than the prediction, at all outputs: no effect reduces the response so much
-ALIVE = 5.0  # ratio of a reading and the prediction, or its inverse, that a working sensor has
+INVERTED_CORRELATION = -0.95  # correlation of a reading with the prediction
+WRONG_UNIT_RATIO = 50.0  # ratio of a reading and the prediction, or its inverse
+MAX_REDUCTION = 500.0  # times smaller than the prediction, at all outputs: no effect reduces the response so much
+MAX_WORKING_RATIO = 5.0  # ratio of a reading and the prediction, or its inverse, that a working sensor has
 # relative level from which a record is louder than another: a dry friction that holds a point at one level leaves less
-# than 1 / ALIVE of its motion at a level no higher than that, so that a sensor at it is not taken for dead
-LOUDER = 1.2
-ABOVE_NOISE = 5.0  # times the noise: smaller signals are not compared
-CORRELATED = 0.5  # correlation of a reading with the prediction, whatever its unit
-SATURATED = 0.5  # share of the samples at the largest magnitude
-LEAST_SAMPLES = 16  # of a record, as in a case folder
+# than 1 / MAX_WORKING_RATIO of its motion at a level no higher than that, so that a sensor at it is not taken for dead
+LOUDER_RATIO = 1.2
+MIN_NOISE_RATIO = 5.0  # times the noise: smaller signals are not compared
+MIN_CORRELATION = 0.5  # correlation of a reading with the prediction, whatever its unit
+MAX_SATURATED_SHARE = 0.5  # share of the samples at the largest magnitude
+MIN_SAMPLES = 16  # of a record, as in a case folder
 # relative tolerances of a natural frequency, a damping and a modal mass: solving a structure again changes them by less
-OFF_FREQUENCY, OFF_DAMPING, OFF_MASS = 1e-3, 0.02, 0.02
-QUADRATURE = 200  # points along a member for the integral of its modal mass
+FREQUENCY_TOLERANCE, DAMPING_TOLERANCE, MASS_TOLERANCE = 1e-3, 0.02, 0.02
+QUADRATURE_POINTS = 200  # points along a member for the integral of its modal mass
 
 
 # standard deviations (n_sensors,) of the readings and of the predictions, by record as a message names it
@@ -80,10 +80,10 @@ def check_alive(
     for these, what in ((records, "record"), (validation, "validation record")):
         for record in these:
             counted = record.n_samples - lead_of(record, transient)
-            if counted < LEAST_SAMPLES:
+            if counted < MIN_SAMPLES:
                 raise RecordsError(
                     f"{what} {record.name!r} has {counted} samples to compare{' after transients' * (transient > 0)};"
-                    f" at least {LEAST_SAMPLES} are needed: take a longer record"
+                    f" at least {MIN_SAMPLES} are needed: take a longer record"
                     f"{' or a shorter transient' * (transient > 0)}"
                 )
         for record in filter(_is_driven, these):
@@ -105,12 +105,12 @@ def _check_dead(rig: Rig, levels: Levels) -> None:
     Other outputs must move there: otherwise the drive may have been off.
     """
     read, expected = (np.array(each) for each in zip(*levels.values(), strict=True))
-    shown = expected > ABOVE_NOISE * np.array([sensor.noise_std for sensor in rig.sensors])
+    shown = expected > MIN_NOISE_RATIO * np.array([sensor.noise_std for sensor in rig.sensors])
     ratios = np.divide(read, expected, out=np.ones_like(read), where=shown)
-    alive = shown & (np.abs(np.log(np.maximum(ratios, 1e-300))) < np.log(ALIVE))
-    dead = shown & (ratios < 1.0 / NO_EFFECT) & alive.any(axis=1, keepdims=True)
+    alive = shown & (np.abs(np.log(np.maximum(ratios, 1e-300))) < np.log(MAX_WORKING_RATIO))
+    dead = shown & (ratios < 1.0 / MAX_REDUCTION) & alive.any(axis=1, keepdims=True)
     for i, j in np.argwhere(dead):
-        no_louder = np.flatnonzero(alive[:, j] & (expected[:, j] < LOUDER * expected[i, j]))
+        no_louder = np.flatnonzero(alive[:, j] & (expected[:, j] < LOUDER_RATIO * expected[i, j]))
         if no_louder.size:
             what, other = (list(levels)[k] for k in (i, no_louder[0]))
             raise RecordsError(
@@ -144,12 +144,12 @@ def _check_signs_and_units(rig: Rig, records: Sequence[Record], what: str, trans
         row = [float(np.corrcoef(y, p)[0, 1]) if np.ptp(p) > 0 else 0.0 for y, p in pairs]
         correlations.append(row)
         levels[f"{what} {record.name!r}"] = level = outputs.std(axis=1), predicted.std(axis=1)
-        ratios.append(_amplitude_ratios(rig, *level, np.abs(row) > CORRELATED))
+        ratios.append(_amplitude_ratios(rig, *level, np.abs(row) > MIN_CORRELATION))
     if not levels:
         return levels
     correlation = np.array(correlations)
-    _check_units(rig, records[0], np.array(ratios), np.abs(correlation) > CORRELATED, what)
-    inverted = np.flatnonzero((correlation < WRONG_SIGN).all(axis=0))
+    _check_units(rig, records[0], np.array(ratios), np.abs(correlation) > MIN_CORRELATION, what)
+    inverted = np.flatnonzero((correlation < INVERTED_CORRELATION).all(axis=0))
     if inverted.size and inverted.size < len(rig.sensors):
         raise RecordsError(
             f"output {rig.sensors[inverted[0]].name!r} reads with the wrong sign: its correlation with the model is"
@@ -163,7 +163,7 @@ def _amplitude_ratios(rig: Rig, read: np.ndarray, expected: np.ndarray, is_corre
 
     Correlation with the prediction shows that a reading is not just noise.
     """
-    least = ABOVE_NOISE * np.array([sensor.noise_std for sensor in rig.sensors])
+    least = MIN_NOISE_RATIO * np.array([sensor.noise_std for sensor in rig.sensors])
     comparable = (expected > least) & ((read > least) | is_correlated)
     return np.where(comparable, read / np.where(comparable, expected, 1.0), np.nan)
 
@@ -176,7 +176,7 @@ def _check_units(rig: Rig, record: Record, ratios: np.ndarray, is_correlated: np
     ratios, is_correlated: (n_records, n_sensors); record: any, for its units.
     """
 
-    def side(some: np.ndarray, factor: float = WRONG_UNIT) -> int:
+    def side(some: np.ndarray, factor: float = WRONG_UNIT_RATIO) -> int:
         """1 if all known ratios are above the factor, -1 if all are below its inverse, else 0."""
         known = some[np.isfinite(some)]
         return int((known > factor).all()) - int((known < 1.0 / factor).all()) if known.size else 0
@@ -184,7 +184,7 @@ def _check_units(rig: Rig, record: Record, ratios: np.ndarray, is_correlated: np
     correlated = np.where(is_correlated, ratios, np.nan)
     wrong = [j for j, column in enumerate(correlated.T) if side(column)]
     n_known = np.isfinite(ratios).any(axis=0).sum()
-    if n_known > 1 and (side(ratios, NO_EFFECT) < 0 or (wrong and side(ratios))):
+    if n_known > 1 and (side(ratios, MAX_REDUCTION) < 0 or (wrong and side(ratios))):
         units = dict.fromkeys(channel.unit for channel in (*record.input_channels, *record.output_channels))
         raise RecordsError(
             f"the outputs read about {_median_in_words(ratios)} times the prediction of the model in every {what}: are"
@@ -216,21 +216,21 @@ def check_modes(rig: Rig) -> None:
         return
     modes, own = rig.modes, modes_of(rig.structure, rig.modes.n_modes)
     remedy = "; take the structure's own modes, or structure=None for modes of your own"
-    off = np.abs(modes.omega - own.omega) > OFF_FREQUENCY * np.maximum(own.omega, own.omega[-1] / own.n_modes**2)
+    off = np.abs(modes.omega - own.omega) > FREQUENCY_TOLERANCE * np.maximum(own.omega, own.omega[-1] / own.n_modes**2)
     for r in np.flatnonzero(off):
         raise ValueError(
             f"mode {r + 1} of the rig has {modes.frequencies_hz[r]:.6g} Hz, that of its structure"
             f" {own.frequencies_hz[r]:.6g} Hz{remedy}"
         )
     damping, expected = np.diag(modes.damping), np.diag(own.damping)
-    off = np.abs(damping - expected) > OFF_DAMPING * np.maximum(expected, expected.max() / own.n_modes**2)
+    off = np.abs(damping - expected) > DAMPING_TOLERANCE * np.maximum(expected, expected.max() / own.n_modes**2)
     for r in np.flatnonzero(off):
         raise ValueError(
             f"mode {r + 1} of the rig is damped by {damping[r]:.4g} rad/s, that of its structure by"
             f" {expected[r]:.4g} rad/s{remedy}"
         )
     masses = _modal_masses(modes, rig.structure)
-    for r in np.flatnonzero(np.abs(masses - 1.0) > OFF_MASS):
+    for r in np.flatnonzero(np.abs(masses - 1.0) > MASS_TOLERANCE):
         raise ValueError(
             f"mode {r + 1} of the rig is not mass-normalised: its modal mass ∫ m φ² is {masses[r]:.4g}, not 1; divide"
             f" its shape by {np.sqrt(masses[r]):.4g}{remedy}"
@@ -241,7 +241,7 @@ def _modal_masses(modes: Modes, structure: Structure | Plate | Membrane) -> Floa
     """Modal masses (n_modes,) ∫ m φ_r² over the structure and its attached masses."""
     if isinstance(modes.domain, NamedPoints):
         raise ValueError("modes at named points are not those of a structure with a length; give structure=None")
-    places, weights = modes.domain.quadrature(QUADRATURE)
+    places, weights = modes.domain.quadrature(QUADRATURE_POINTS)
     if isinstance(structure, Structure):
         density = structure.mass_per_length(places)
     else:
@@ -264,7 +264,7 @@ def _check_not_saturated(rig: Rig, records: Sequence[Record]) -> None:
         top = max((float(np.abs(record.outputs[j]).max()) for record in records), default=0.0)
         at_top = [np.abs(record.outputs[j]) >= top * (1 - 1e-9) for record in records]
         share = np.concatenate(at_top).mean() if at_top else 0.0
-        if top > 0 and share > SATURATED:
+        if top > 0 and share > MAX_SATURATED_SHARE:
             raise RecordsError(
                 f"record {records[int(np.argmax([s.mean() for s in at_top]))].name!r}: output {sensor.name!r} is at"
                 f" ±{top:g} for {100 * share:.0f} % of all its samples: it is saturated; lower the level or the gain"

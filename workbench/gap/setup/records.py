@@ -20,8 +20,8 @@ from workbench.structure.printed import joined_in_words
 NOISE_MULTIPLE = 10.0  # standard deviations of the noise
 SIGNAL_SHARE = 0.3  # standard deviations of the readings
 JUMP_MULTIPLE = 2.0  # times the first reading that the rig predicts from rest, which a wrong rig misjudges
-LONG, SHORTEST = 0.02, 20  # share of a record, and samples: longer runs of equal readings are not by chance
-MOVES = 0.1  # of its standard deviation over the record: a working sensor moves by more meanwhile
+MAX_RUN_SHARE, MAX_RUN = 0.02, 20  # share of a record, and samples: longer runs of equal readings are not by chance
+MIN_MOTION_SHARE = 0.1  # of its standard deviation over the record: a working sensor moves by more meanwhile
 
 
 def check_names(records: Sequence[Record]) -> None:
@@ -132,10 +132,10 @@ def _stuck(record: Record) -> list[str]:
     for j, y in enumerate(record.outputs):
         begin, end = _longest_run(y)
         others = [i for i in range(len(names)) if i != j]
-        alive = [record.outputs[i, begin:end].std() > MOVES * deviations[i] for i in others]
+        alive = [record.outputs[i, begin:end].std() > MIN_MOTION_SHARE * deviations[i] for i in others]
         clipped = abs(y[begin]) > 0.999 * np.abs(y).max()
         quantised = np.count_nonzero(y == y[begin]) > end - begin  # the same reading occurs elsewhere too
-        if end - begin > max(LONG * y.size, SHORTEST) and any(alive) and not (clipped or quantised):
+        if end - begin > max(MAX_RUN_SHARE * y.size, MAX_RUN) and any(alive) and not (clipped or quantised):
             seconds = record.start_time + record.sample_time * np.array([begin, end])
             found.append(
                 f"Record {record.name!r}: {names[j]} reads {y[begin]:.4g} without change from {seconds[0]:.4g} s to"

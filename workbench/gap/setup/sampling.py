@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from workbench.gap.prediction.residuals import lead_of
-from workbench.gap.setup.comparison import CLOSED, LARGEST_LEFT, Comparison, compared_bands
+from workbench.gap.setup.comparison import MAX_RESIDUAL_SHARE, MIN_CLOSED_SHARE, Comparison, compared_bands
 from workbench.gap.setup.corrections import (
     RATES,
     TURN,
@@ -27,14 +27,16 @@ from workbench.gap.setup.corrections import (
 from workbench.records.band_limited import angles
 from workbench.structure.damping import ModalDamping
 
-PER_CENT_FROM = 0.05  # damping ratio above which per cent may have been meant
-FARTHEST = 20  # samples: largest delay that is tried, either way
-DIFFERING = 1.0  # sample times by which the delays of two records must differ; one of all records is an effect
-LEAST_DELAY = 0.25  # samples, beside the record of least delay, from which a record is corrected
-WHOLE = 0.1  # samples: a delay as near to a whole number is that number, since a trigger counts samples
-LEAST_MODES = 2  # that show the delay: in one mode, a shifted resonance delays too
-ALIKE = 0.95  # cosine of the levels of the inputs, each over its largest, from which the same inputs drive two records
-CLEAR = 4.0  # times the noise power: a smaller residual of an output shows no delay
+MAX_DAMPING_RATIO = 0.05  # damping ratio above which per cent may have been meant
+MAX_DELAY = 20  # samples: largest delay that is tried, either way
+# sample times by which the delays of two records must differ; one of all records is an effect
+MIN_DELAY_DIFFERENCE = 1.0
+MIN_DELAY = 0.25  # samples, beside the record of least delay, from which a record is corrected
+WHOLE_TOLERANCE = 0.1  # samples: a delay as near to a whole number is that number, since a trigger counts samples
+MIN_MODES = 2  # that show the delay: in one mode, a shifted resonance delays too
+# cosine of the levels of the inputs, each over its largest, from which the same inputs drive two records
+MIN_LEVEL_COSINE = 0.95
+MIN_NOISE_RATIO = 4.0  # times the noise power: a smaller residual of an output shows no delay
 
 
 def sampling_rates(gap: Comparison) -> list[SetupFault]:
@@ -50,7 +52,7 @@ def sampling_rates(gap: Comparison) -> list[SetupFault]:
             if 2 * lead_of(other, gap.transient) < other.n_samples  # otherwise few samples would be left to compare
         }
         best = max(shares, key=lambda factor: shares[factor], default=None)
-        if best is not None and shares[best] >= CLOSED:
+        if best is not None and shares[best] >= MIN_CLOSED_SHARE:
             wrong.setdefault(best, []).append(i)
     faults = []
     for factor, at in wrong.items():
@@ -69,7 +71,7 @@ def modal_units(gap: Comparison) -> list[SetupFault]:
     rig, records = gap.rig, gap.records
     candidates: list[tuple[str, str, Correction]] = []
     zeta = float(rig.modes.zeta.max(initial=0.0))
-    if zeta > PER_CENT_FROM and (rig.structure is None or isinstance(rig.structure.damping, ModalDamping)):
+    if zeta > MAX_DAMPING_RATIO and (rig.structure is None or isinstance(rig.structure.damping, ModalDamping)):
         sentence = (
             f"The damping looks like per cent where a ratio is meant: divide it by 100 (the largest would be"
             f" {zeta / 100:.4g}, not {zeta:.4g})."
@@ -80,7 +82,7 @@ def modal_units(gap: Comparison) -> list[SetupFault]:
             sentence = f"The natural frequencies look like {words} meant: multiply them by {factor:.6g}."
             candidates.append(("frequency", sentence, partial(modes_times, factor, 1.0)))
     faults = [SetupFault(kind, what, gap.closes(*by(rig, records)), by) for kind, what, by in candidates]
-    return sorted((fault for fault in faults if fault.closes >= CLOSED), key=lambda fault: -fault.closes)[:1]
+    return sorted((fault for fault in faults if fault.closes >= MIN_CLOSED_SHARE), key=lambda fault: -fault.closes)[:1]
 
 
 def late_records(gaps: Sequence[Comparison]) -> list[SetupFault]:
@@ -97,7 +99,7 @@ def late_records(gaps: Sequence[Comparison]) -> list[SetupFault]:
     shares /= np.linalg.norm(shares, axis=1, keepdims=True)
     left, faults = list(range(len(driven))), []
     while left:
-        alike = [i for i in left if shares[i] @ shares[left[0]] > ALIKE]
+        alike = [i for i in left if shares[i] @ shares[left[0]] > MIN_LEVEL_COSINE]
         faults += _late_among([driven[i] for i in alike])
         left = [i for i in left if i not in alike]
     return faults
@@ -110,17 +112,17 @@ def _late_among(gaps: Sequence[Comparison]) -> list[SetupFault]:
         return []
     sample_times = np.array([gap.records[0].sample_time for gap in gaps])
     times = np.array(delays) * sample_times
-    if np.ptp(times) <= DIFFERING * sample_times.max():
+    if np.ptp(times) <= MIN_DELAY_DIFFERENCE * sample_times.max():
         return []
     closed = [_closed(gap, delay) for gap, delay in zip(gaps, delays, strict=True)]
-    if min(closed) < CLOSED:
+    if min(closed) < MIN_CLOSED_SHARE:
         return []
     least = int(np.argmin(np.abs(times)))
     faults = []
     for gap, beside, closes in zip(gaps, (times - times[least]) / sample_times, closed, strict=True):
         (record,), late = gap.records, float(beside)
-        late = float(np.round(late)) if abs(late - np.round(late)) < WHOLE else late
-        if abs(late) > LEAST_DELAY:
+        late = float(np.round(late)) if abs(late - np.round(late)) < WHOLE_TOLERANCE else late
+        if abs(late) > MIN_DELAY:
             how, remedy = ("late", "earlier") if late > 0 else ("early", "later")
             by = f"{abs(late):.3g} sample{'s' * (abs(late) != 1.0)}"
             sentence = (
@@ -137,7 +139,7 @@ def _delay_of(gap: Comparison) -> float | None:
 
     None where the correlation is largest at an end of the range, or too few modes show it.
     """
-    if np.count_nonzero(compared_bands(gap.measured_spectra).any(axis=(0, 1))) < LEAST_MODES:
+    if np.count_nonzero(compared_bands(gap.measured_spectra).any(axis=(0, 1))) < MIN_MODES:
         return None
     (measured,), (predicted,) = gap.measured_spectra.lines, gap.simulated_spectra.lines
     cross = np.sum(measured * predicted.conj() / gap.scale[:, None], axis=0)
@@ -145,7 +147,7 @@ def _delay_of(gap: Comparison) -> float | None:
         return None
     n = gap.n_samples
     at = angles(n)[: cross.size]
-    reach = max(min(FARTHEST, n // 2 - 1), 0)
+    reach = max(min(MAX_DELAY, n // 2 - 1), 0)
     tried = np.arange(-reach, reach + 1)
     whole = int(tried[np.argmax(np.fft.irfft(cross, n)[tried])])
     if whole in (tried[0], tried[-1]):
@@ -159,8 +161,8 @@ def _delay_of(gap: Comparison) -> float | None:
 
 def _closed(gap: Comparison, delay: float) -> float:
     """Share of the gap of a record that its delay closes, the median over outputs; 1 without a delay and a gap."""
-    if abs(delay) <= LEAST_DELAY:
-        return float(np.median(gap.before) < LARGEST_LEFT)
-    clear = gap.before > CLEAR * gap.noise
+    if abs(delay) <= MIN_DELAY:
+        return float(np.median(gap.before) < MAX_RESIDUAL_SHARE)
+    clear = gap.before > MIN_NOISE_RATIO * gap.noise
     after = gap.corrected(partial(outputs_earlier, delay)).before
     return float(np.median(gap.closed(after)[clear])) if clear.any() else 0.0

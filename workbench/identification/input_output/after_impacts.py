@@ -24,10 +24,13 @@ from workbench.records.record import Record
 class AfterImpactsSettings:
     """Constants of the identification from free decays."""
 
-    share: float = 0.4  # of the time of an identification; a search that starts from these modes takes a tenth of it
-    least: float = 0.5  # share of a record that must follow the last impact
-    matters: float = 0.1  # of the half-power bandwidth: a mode whose frequency varies less over a decay is linear
-    near: float = 0.1  # of the frequency of a mode, within which one identified from the whole record is the same
+    # of the time of an identification; a search that starts from these modes takes a tenth of it
+    time_share: float = 0.4
+    min_decay_share: float = 0.5  # of a record that must follow the last impact
+    # of the half-power bandwidth: a mode whose frequency varies less over a decay is linear
+    min_frequency_change: float = 0.1
+    # of the frequency of a mode, within which one identified from the whole record is the same
+    frequency_tolerance: float = 0.1
 
 
 AFTER_IMPACTS = AfterImpactsSettings()
@@ -63,7 +66,7 @@ class AfterImpacts:
         matches = {}
         for k, pole in enumerate(self.changing):
             r = int(np.argmin(np.abs(poles - pole)))
-            if abs(poles[r] - pole) < AFTER_IMPACTS.near * abs(pole):
+            if abs(poles[r] - pole) < AFTER_IMPACTS.frequency_tolerance * abs(pole):
                 matches[r] = k
         return matches
 
@@ -73,7 +76,7 @@ def after_impacts(records: Sequence[Record], time_limit: TimeLimit) -> AfterImpa
     decays = [decay for record in records if (decay := _free_decay(record))]
     if len(decays) < len(records):
         return AfterImpacts()
-    share = time_limit.aside(AFTER_IMPACTS.share)
+    share = time_limit.aside(AFTER_IMPACTS.time_share)
     with suppress(ValueError, np.linalg.LinAlgError):  # no mode in free decay: the driven response alone is used
         refined = identify_within(decays, share).without_artefacts(np.pi / decays[0].sample_time).refined
         by_amplitude = amplitude_dependence(decays, refined, time_limit=share)
@@ -86,7 +89,7 @@ def _free_decay(record: Record) -> Record | None:
     """The free decay after the last nonzero input, if it is most of the record."""
     driven = np.flatnonzero(record.inputs.any(axis=0))
     first = int(driven[-1]) + 2 if driven.size else record.n_samples  # a first-order hold ends a sample later
-    if record.n_samples - first < AFTER_IMPACTS.least * record.n_samples:
+    if record.n_samples - first < AFTER_IMPACTS.min_decay_share * record.n_samples:
         return None
     decay = record.between(record.start_time + first * record.sample_time)
     return replace(decay, inputs=decay.inputs[:0], input_channels=())
@@ -96,7 +99,7 @@ def _significant(refined: RefinedModes, by_amplitude: AmplitudeDependence) -> Af
     """The amplitude-dependent modes whose frequency varies by a significant part of the bandwidth."""
     poles, depends = refined.modes.poles, np.flatnonzero(by_amplitude.depends).tolist()
     omega = {r: by_amplitude.omega[np.isfinite(by_amplitude.omega[:, r]), r] for r in depends}
-    changing = [r for r in depends if np.ptp(omega[r]) > AFTER_IMPACTS.matters * abs(poles[r].real)]
+    changing = [r for r in depends if np.ptp(omega[r]) > AFTER_IMPACTS.min_frequency_change * abs(poles[r].real)]
     if not changing:
         return AfterImpacts()
     scatter = tuple(float(omega[r].std()) for r in changing)

@@ -37,11 +37,11 @@ from workbench.structure.modes import mac
 class ChangingDecaySettings:
     """Constants of the search for one changing mode in place of several linear ones."""
 
-    smooth: int = 2  # degree of the polynomial for the residual of the other modes
+    polynomial_degree: int = 2  # for the residual of the other modes
     knots: int = 100  # of the spline in time
-    ends: float = 8.0  # duration of a decay, in time constants
-    most_tries: int = 25  # evaluations of a fit
-    largest: float = 1e6  # |m| above which the motion is taken to diverge
+    duration: float = 8.0  # of a decay, in time constants
+    max_evaluations: int = 25  # evaluations of a fit
+    max_motion: float = 1e6  # |m| above which the motion is taken to diverge
 
 
 DECAY = ChangingDecaySettings()
@@ -51,7 +51,7 @@ def beside_changing(lines: Lines, fit: Fit, limit: float, time_limit: TimeLimit)
     """The lines with the columns of changing modes, and the fit with one mode for each of these; None where linear
     modes, of χ² threshold `limit`, are likelier at every peak."""
     shapes, participation = fit.amplitudes / fit.noise[:, None], fit.participation.T
-    alike = mac(shapes, shapes) * mac(participation, participation) > COMPETING.alike
+    alike = mac(shapes, shapes) * mac(participation, participation) > COMPETING.min_mac
     within = (fit.poles.imag > lines.omega[0]) & (fit.poles.imag < lines.omega[-1])
     alternative_of = partial(_alternative_of, fit=fit, limit=limit)
     return in_place_of_clusters(lines, fit, alike & within & within[:, None], alternative_of, time_limit)
@@ -61,11 +61,11 @@ def _alternative_of(lines: Lines, cluster: np.ndarray, fit: Fit, limit: float) -
     """`in_place_of_clusters`, for one cluster: the lines beside the changing mode, and its pole."""
     weighted_shape, poles = fit.amplitudes[:, cluster[0]] / fit.noise**2, fit.poles[cluster]
     strength = weighted_shape.conj() @ fit.amplitudes[:, cluster]
-    rates = np.maximum(-poles.real, COMPETING.slowest * lines.resolution)
+    rates = np.maximum(-poles.real, COMPETING.min_rate * lines.resolution)
     mean = complex(np.average(-rates + 1j * poles.imag, weights=np.abs(strength) ** 2 / rates))
-    margin = max(COMPETING.about * -mean.real, COMPETING.fewest * lines.resolution)
+    margin = max(COMPETING.band_margin * -mean.real, COMPETING.min_margin_lines * lines.resolution)
     near_peak = (lines.omega > poles.imag.min() - margin) & (lines.omega < poles.imag.max() + margin)
-    peak = _Peak(lines.only(near_peak, DECAY.smooth), fit, cluster, mean)
+    peak = _Peak(lines.only(near_peak, DECAY.polynomial_degree), fit, cluster, mean)
     linear = peak.fitted(_linear, [np.r_[poles - mean, strength[1:] / strength[0] * -mean.real] / -mean.real])
     if linear is None:
         return None
@@ -98,7 +98,7 @@ class _Decays:
 
     def __init__(self, lines: Lines, pole: complex, participation: np.ndarray) -> None:
         self.lines, self.pole, self.rate, self.participation = lines, pole, -pole.real, participation
-        end, record = DECAY.ends / self.rate, 2.0 * np.pi / lines.resolution
+        end, record = DECAY.duration / self.rate, 2.0 * np.pi / lines.resolution
         counts = lines.omega / lines.resolution
         # At multiples of 1/T the transform of a linear mode's decay, cut off at T, still has the form of its pole.
         if np.abs(counts - np.round(counts)).max() < 1e-3:
@@ -188,7 +188,7 @@ class _Peak:
             unknowns = np.r_[start.real, start.imag]
             if not once(unknowns)[1].any():
                 continue
-            unknowns = once.least(unknowns, DECAY.most_tries)
+            unknowns = once.least(unknowns, DECAY.max_evaluations)
             squares = float((once(unknowns)[0] ** 2).sum())
             if squares < smallest:
                 best, smallest = unknowns, squares
@@ -221,7 +221,7 @@ class _Peak:
 
     def _residual(self, motions: np.ndarray) -> tuple[Floats, Floats]:
         """Residual (n,) and its Jacobian (n, n_unknowns)."""
-        if not (np.abs(motions) < DECAY.largest).all():
+        if not (np.abs(motions) < DECAY.max_motion).all():
             return diverged(np.concatenate(self.values), motions.shape[1] - 1)
         rows, n = np.hstack(self.decays.rows(motions)), motions.shape[1]
 

@@ -28,24 +28,25 @@ from workbench.identification.signal.searches import TimeLimit, diverged, projec
 class ChangingResponseSettings:
     """Constants of the fit of one changing mode to records with known inputs."""
 
-    most_tries: int = 40  # evaluations of a fit
-    insensitive: float = 1e-4  # of the largest column of the Jacobian: an unknown of a smaller one is held
-    faded: float = 16.0  # standard deviations of time about the mean time of the energy, beyond which the rate is held
-    least: float = 1e-3  # of the largest amplitude: below it the rate is held
-    undriven: float = 1e-12  # forcing over the largest amplitude, below which the mode is in free decay, or at rest
-    step: float = 0.005  # time constants: largest step of a free decay
-    largest: float = 1e3  # times the amplitude of the constant mode: beyond this a motion diverges
+    max_evaluations: int = 40  # evaluations of a fit
+    min_sensitivity: float = 1e-4  # of the largest column of the Jacobian: an unknown of a smaller one is held
+    # standard deviations of time about the mean time of the energy, beyond which the rate is held
+    max_time_deviations: float = 16.0
+    min_amplitude: float = 1e-3  # of the largest amplitude: below it the rate is held
+    min_forcing: float = 1e-12  # forcing over the largest amplitude, below which the mode is in free decay, or at rest
+    max_decay_step: float = 0.005  # time constants: largest step of a free decay
+    max_amplitude_ratio: float = 1e3  # times the amplitude of the constant mode: beyond this a motion diverges
     # logarithm of the squares beyond those that the linear modes leave, from which a law is given up after its first
     # step. Of laws that were right in the end it was 1 at most, of two linear modes in place of one it is 4 to 9
-    given_up: float = 2.5
+    max_first_excess: float = 2.5
     # the same of the law of time, from which no other law is tried. It was 3.5 at most where one of amplitude was right
-    linear: float = 5.0
+    max_time_excess: float = 5.0
     # evaluations within which the same must fall, by a share of what is left or by the least that counts. Laws that
     # were right in the end halved it by each, until it was none by the third; wrong ones fell slowly for 15 to 40
-    within: int = 2
-    stalled: float = 0.5
-    same: float = 0.1  # decay rates, by which the poles of a cluster that is not tried again may have moved
-    settled: float = 1e-3  # the standard error of the logarithm of the squares of some thousand lines is larger
+    stall_evaluations: int = 2
+    min_decrease_share: float = 0.5
+    pole_tolerance: float = 0.1  # decay rates, by which the poles of a cluster that is not tried again may have moved
+    min_decrease: float = 1e-3  # the standard error of the logarithm of the squares of some thousand lines is larger
 
 
 RESPONSE = ChangingResponseSettings()
@@ -86,7 +87,7 @@ def in_place_of(
     whichever the model.
     """
     poles = fit.poles[cluster]
-    same = -RESPONSE.same * poles.real
+    same = -RESPONSE.pole_tolerance * poles.real
     if any(each.size == poles.size and (np.abs(each - poles) < same).all() for each in linear):
         return None
     response = _Response(data, fit, cluster, rows)
@@ -105,7 +106,7 @@ def in_place_of(
             changing = response.fitted(law, squares + limit * fewer / response.values.size, time_limit)
         except _GivenUp as end:
             given_up.add(law)
-            if by_time and end.least > RESPONSE.linear:
+            if by_time and end.least > RESPONSE.max_time_excess:
                 break
         else:
             if changing is not None:
@@ -251,11 +252,11 @@ class _Response:
 
     def __init__(self, data: KnownInputs, fit: Fit, cluster: np.ndarray, rows: Floats) -> None:
         self.data, self.fit, self.cluster, poles = data, fit, cluster, fit.poles[cluster]
-        rates = np.maximum(-poles.real, COMPETING.slowest * data.resolution)
+        rates = np.maximum(-poles.real, COMPETING.min_rate * data.resolution)
         power = np.abs(fit.amplitudes[:, cluster] / fit.noise[:, None]).max(axis=0) ** 2 / rates
         self.pole = complex(np.average(-rates + 1j * poles.imag, weights=power))
         self.rate, self.participation = -self.pole.real, fit.participation[cluster[0]]
-        margin = max(COMPETING.about * self.rate, COMPETING.fewest * data.resolution)
+        margin = max(COMPETING.band_margin * self.rate, COMPETING.min_margin_lines * data.resolution)
         self.low, self.high = poles.imag.min() - margin, poles.imag.max() + margin
         self.coordinates = self._coordinates(self.pole)
         norms = np.sqrt(sum((np.abs(z) ** 2).sum(axis=0) for z in self.coordinates))
@@ -304,7 +305,7 @@ class _Response:
         unknowns, at_start = best.copy(), self._residual(best, law, True)
         sensitivity = np.linalg.norm(at_start[1], axis=0)
         # After an impact, an initial state excites a mode as the input does.
-        active = sensitivity > RESPONSE.insensitive * sensitivity.max()
+        active = sensitivity > RESPONSE.min_sensitivity * sensitivity.max()
         if not active.any():
             return None
         beyond: list[float] = []
@@ -314,12 +315,12 @@ class _Response:
                 raise _GivenUp(min(beyond, default=0.0))
             unknowns[active] = x
             residual = self._residual(unknowns, law)[0] if beyond else at_start[0]
-            least, before = min(beyond, default=np.inf), min(beyond[: -RESPONSE.within + 1], default=np.inf)
+            least, before = min(beyond, default=np.inf), min(beyond[: -RESPONSE.stall_evaluations + 1], default=np.inf)
             beyond.append(float(np.log(_squares(residual))) - threshold)
             if beyond[-1] < least:
                 best[:], least = unknowns, beyond[-1]
-            given_up = len(beyond) == 2 and least > RESPONSE.given_up
-            if given_up or before - least < max(RESPONSE.stalled * least, RESPONSE.settled):
+            given_up = len(beyond) == 2 and least > RESPONSE.max_first_excess
+            if given_up or before - least < max(RESPONSE.min_decrease_share * least, RESPONSE.min_decrease):
                 raise _GivenUp(least)
             return residual
 
@@ -328,7 +329,7 @@ class _Response:
             return jacobian[:, active]
 
         try:
-            least_squares(residual_of, best[active], jacobian_of, x_scale="jac", max_nfev=RESPONSE.most_tries)
+            least_squares(residual_of, best[active], jacobian_of, x_scale="jac", max_nfev=RESPONSE.max_evaluations)
         except _GivenUp:
             if time_limit.is_past or min(beyond) > 0.0:
                 raise
@@ -343,8 +344,8 @@ class _Response:
         (by_time, powers), size = law, 1 + len(law[1])
         each = []
         for z, rate in self.linear_motions:
-            time = np.minimum((np.arange(z.size) / z.size - self.middle) / self.width, RESPONSE.faded)
-            along = time if by_time else np.maximum(np.abs(z) / self.scale, RESPONSE.least)
+            time = np.minimum((np.arange(z.size) / z.size - self.middle) / self.width, RESPONSE.max_time_deviations)
+            along = time if by_time else np.maximum(np.abs(z) / self.scale, RESPONSE.min_amplitude)
             each.append(np.column_stack([z, *(along**power * z for power in powers), rate]))
         rows = np.vstack(each)
         products = rows[:, :size].conj().T @ rows
@@ -379,12 +380,12 @@ class _Response:
         for z in self.coordinates:
             constant = np.column_stack([z @ participation, z[:, self.others] * self.units])
             drive = constant[1:] - step * constant[:-1]
-            driven_samples = np.flatnonzero(np.abs(drive).max(axis=1) > RESPONSE.undriven * self.scale)
+            driven_samples = np.flatnonzero(np.abs(drive).max(axis=1) > RESPONSE.min_forcing * self.scale)
             simulated = _simulated(
                 constant[0], drive, self.rate * coefficients[:size], np.array(powers), by_time, step, self.scale,
-                RESPONSE.least, RESPONSE.largest, dt, self.middle, self.width, RESPONSE.faded,
-                int(driven_samples[-1]) + 1 if driven_samples.size else 0,
-                max(int(RESPONSE.step / (self.rate * dt)), 1), RESPONSE.undriven, slopes,
+                RESPONSE.min_amplitude, RESPONSE.max_amplitude_ratio, dt, self.middle, self.width,
+                RESPONSE.max_time_deviations, int(driven_samples[-1]) + 1 if driven_samples.size else 0,
+                max(int(RESPONSE.max_decay_step / (self.rate * dt)), 1), RESPONSE.min_forcing, slopes,
             )  # fmt: skip
             if slopes:
                 simulated[:, 1 : 1 + size] *= self.rate

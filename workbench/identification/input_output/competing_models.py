@@ -33,18 +33,18 @@ from workbench.threads import at_once
 class CompetingModelSettings:
     """Constants of the comparison of one changing mode with several linear ones."""
 
-    near: float = 6.0  # half-power bandwidths: linear modes closer than this may be one changing mode
-    most_clusters: int = 3  # tried per mode: all modes close to it, then without the farthest
-    about: float = 12.0  # half-power half-widths beyond the modes, in which the models are compared
-    fewest: int = 25  # lines beyond the modes, likewise at least
-    slowest: float = 0.05  # of the distance of lines: smallest decay rate
-    alike: float = 0.9  # MAC of such modes
-    most_poles: int = 20  # steps to the linear mode nearest to a changing one
-    same_pole: float = 1e-6  # of the decay rate: a smaller step ends them
-    collinear: float = 1e-9  # singular value of columns of unit length, below which it is rounding error
+    max_distance: float = 6.0  # half-power bandwidths: linear modes closer than this may be one changing mode
+    max_clusters: int = 3  # tried per mode: all modes close to it, then without the farthest
+    band_margin: float = 12.0  # half-power half-widths beyond the modes, in which the models are compared
+    min_margin_lines: int = 25  # lines beyond the modes, likewise at least
+    min_rate: float = 0.05  # of the distance of lines: smallest decay rate
+    min_mac: float = 0.9  # MAC of such modes
+    max_pole_steps: int = 20  # steps to the linear mode nearest to a changing one
+    step_tolerance: float = 1e-6  # of the decay rate: a smaller step ends them
+    min_singular_value: float = 1e-9  # of columns of unit length: below, it is rounding error
     # of the largest singular value: the products of columns give those above it to four digits
-    clear: float = 1e-6
-    significant: float = 1e-4  # singular value of the columns of a changing mode, above which they count
+    min_singular_ratio: float = 1e-6
+    min_change_value: float = 1e-4  # singular value of the columns of a changing mode: smaller ones do not count
 
 
 COMPETING = CompetingModelSettings()
@@ -70,7 +70,7 @@ def in_place_of_clusters(
     strength = statistic_of_each(fit)
     rates = np.maximum(-fit.poles.real, 0.5 * data.resolution)
     distance = np.abs(np.subtract.outer(fit.poles.imag, fit.poles.imag))
-    close = alike & (distance < COMPETING.near * np.add.outer(rates, rates))
+    close = alike & (distance < COMPETING.max_distance * np.add.outer(rates, rates))
     poles, removed, order = fit.poles.copy(), np.zeros(fit.poles.size, bool), np.argsort(-strength)
 
     def clusters(first: int) -> Iterator[tuple[int, np.ndarray]]:
@@ -78,7 +78,7 @@ def in_place_of_clusters(
         for rank, r in enumerate(order[first:], first):
             others = np.flatnonzero(close[r] & (strength < strength[r]) & ~removed & ~removed[r])
             others = others[np.argsort(distance[r, others])]
-            for k in range(others.size, max(others.size - COMPETING.most_clusters, 0), -1):
+            for k in range(others.size, max(others.size - COMPETING.max_clusters, 0), -1):
                 yield rank, np.r_[r, others[:k]]
 
     tries = clusters(0)
@@ -106,7 +106,7 @@ def orthonormal_basis(rows: np.ndarray, least: float) -> Floats:
     basis = np.empty((len(rows), 0))
     while rows.shape[1]:
         squares, directions = np.linalg.eigh(rows.T @ rows)
-        clear = squares > max(least**2, COMPETING.clear**2 * squares[-1])
+        clear = squares > max(least**2, COMPETING.min_singular_ratio**2 * squares[-1])
         if not clear.any():
             break
         basis = np.hstack([basis, orthonormal(rows @ (directions[:, clear] / np.sqrt(squares[clear])))[0]])
@@ -123,9 +123,9 @@ def beyond_linear(data: Measurement, motions: np.ndarray, pole: complex, l_r: np
     """
     pole = _nearest_pole(data, motions[:, 0], pole, l_r)
     linear = np.column_stack([*modal_coordinate(data.responses(pole), l_r), *data.slopes(pole, l_r)])
-    linear = orthonormal_basis(normalised_columns(np.hstack([linear, data.fixed])), COMPETING.collinear)
+    linear = orthonormal_basis(normalised_columns(np.hstack([linear, data.fixed])), COMPETING.min_singular_value)
     motions = normalised_columns(motions)
-    return orthonormal_basis(motions - linear @ (linear.T @ motions), COMPETING.significant), pole
+    return orthonormal_basis(motions - linear @ (linear.T @ motions), COMPETING.min_change_value), pole
 
 
 def bases_with_changes(
@@ -144,14 +144,14 @@ def bases_with_changes(
     bases = []
     for weight, a in zip(weights, np.repeat(fit.amplitudes[:, modes], of_mode // step, axis=1), strict=True):
         each = weight * np.hstack([phi, changes_of(a, (real[:, ::step], imaginary[:, ::step]))])
-        bases.append(orthonormal_basis(normalised_columns(each), COMPETING.collinear))
+        bases.append(orthonormal_basis(normalised_columns(each), COMPETING.min_singular_value))
     return bases
 
 
 def _nearest_pole(data: Measurement, motion: np.ndarray, pole: complex, l_r: np.ndarray) -> complex:
     """Pole of the linear mode, of given participation factors, nearest to a motion (n_rows,) in least squares."""
     rate, best, step, smallest = abs(pole.real), pole, 0j, np.inf
-    for _ in range(COMPETING.most_poles):
+    for _ in range(COMPETING.max_pole_steps):
         trial = best + step
         z = np.column_stack(modal_coordinate(data.responses(trial), l_r))
         size = np.maximum(np.linalg.norm(z, axis=0), 1e-300)
@@ -167,6 +167,6 @@ def _nearest_pole(data: Measurement, motion: np.ndarray, pole: complex, l_r: np.
         else:
             step *= 0.25
         step = min(step.real, -0.5 * best.real) + 1j * step.imag  # keeps the pole stable
-        if abs(step) < COMPETING.same_pole * rate:
+        if abs(step) < COMPETING.step_tolerance * rate:
             break
     return best

@@ -15,20 +15,21 @@ from workbench.structure.printed import mode_text
 class ExcitationSettings:
     """Constants of the checks of the inputs and of the detection of impacts and of rest."""
 
-    hardly: float = 1e-3  # of the mean power of a line, 3 % of its amplitude: less hardly excites a mode
-    about: float = 0.02  # of the frequency of a mode, to either side, in which the lines count
-    lines: int = 4  # to either side, at least
-    moves: float = 0.01  # of its peak, above which an input is nonzero
-    loud: float = 6.0  # standard deviations of the reading between impacts: normal noise exceeds them once in 5e8
-    clear: float = 30.0  # likewise, that the peak of an impact exceeds
-    most: float = 0.1  # share of a record that impacts take; another excitation takes more
+    min_power_ratio: float = 1e-3  # of the mean power of a line, 3 % of its amplitude: less hardly excites a mode
+    band_margin: float = 0.02  # of the frequency of a mode, to either side, in which the lines count
+    min_lines: int = 4  # to either side, at least
+    nonzero_share: float = 0.01  # of its peak, above which an input is nonzero
+    # standard deviations of the reading between impacts: normal noise exceeds them once in 5e8
+    noise_deviations: float = 6.0
+    peak_ratio: float = 30.0  # likewise, that the peak of an impact exceeds
+    impact_share: float = 0.1  # of a record that impacts take; another excitation takes more
     # correlation, at any lag, of the reading between impacts with an output, above which it is a force: that of an
     # attached shaker. That of noise is at most 4.5 over the root of the number of samples
-    follows: float = 0.3
-    fewest: int = 500  # samples before the first force, as before the trigger of an impact test
+    max_correlation: float = 0.3
+    min_rest_samples: int = 500  # samples before the first force, as before the trigger of an impact test
     # standard errors of the variance of white noise, by which that of the outputs there may exceed the least of all
     # parts as long after it, which of fifty parts is two below the mean
-    louder: float = 4.0
+    variance_deviations: float = 4.0
 
 
 EXCITATION = ExcitationSettings()
@@ -62,7 +63,7 @@ def check_inputs(records: Sequence[Record]) -> None:
 def n_moving(records: Sequence[Record]) -> int:
     """Number of samples at which an input is nonzero, the least of all inputs."""
     sizes = np.abs(np.hstack([record.inputs for record in records]))
-    return int((sizes > EXCITATION.moves * sizes.max(axis=1, keepdims=True)).sum(axis=1).min())
+    return int((sizes > EXCITATION.nonzero_share * sizes.max(axis=1, keepdims=True)).sum(axis=1).min())
 
 
 def unexcited_remarks(records: Sequence[Record], poles: Complexes) -> tuple[str, ...]:
@@ -76,13 +77,13 @@ def unexcited_remarks(records: Sequence[Record], poles: Complexes) -> tuple[str,
         power = (np.abs(np.fft.rfft(record.inputs * np.hanning(record.n_samples))) ** 2).sum(axis=0)
         mean, bin_width = power.mean(), 2.0 * np.pi / (record.n_samples * record.sample_time)
         for r, pole in enumerate(poles):
-            half = max(2.0 * abs(pole.real), EXCITATION.about * pole.imag, EXCITATION.lines * bin_width)
+            half = max(2.0 * abs(pole.real), EXCITATION.band_margin * pole.imag, EXCITATION.min_lines * bin_width)
             first = max(int((pole.imag - half) / bin_width), 0)
             about = power[first : int((pole.imag + half) / bin_width) + 2]
             amplitude[r] = max(amplitude[r], np.sqrt(about.mean() / mean)) if about.size else amplitude[r]
     words = [
         mode_text(r, abs(poles[r]) / (2.0 * np.pi), f", {100 * amplitude[r]:.1g} % of their mean amplitude")
-        for r in np.flatnonzero(amplitude**2 < EXCITATION.hardly).tolist()
+        for r in np.flatnonzero(amplitude**2 < EXCITATION.min_power_ratio).tolist()
     ]
     if not words:
         return ()
@@ -120,9 +121,9 @@ def force_window(records: Sequence[Record]) -> tuple[tuple[Record, ...], tuple[s
 
 def _in_impacts(force: Floats, noise: float) -> Flags:
     """Samples (n_samples,) within an impact, or its length before or after it; none where it is no impact test."""
-    loud = np.abs(force) > EXCITATION.loud * noise
+    loud = np.abs(force) > EXCITATION.noise_deviations * noise
     in_impact = np.zeros(force.size, bool)
-    if noise == 0.0 or np.abs(force).max() < EXCITATION.clear * noise or loud.mean() > EXCITATION.most:
+    if noise == 0.0 or np.abs(force).max() < EXCITATION.peak_ratio * noise or loud.mean() > EXCITATION.impact_share:
         return in_impact
     ends = np.flatnonzero(np.diff(np.r_[False, loud, False]))
     for begin, end in zip(ends[::2], ends[1::2], strict=True):
@@ -137,7 +138,7 @@ def _correlates(force: Floats, outputs: Floats) -> bool:
     force_spectrum, output_spectra = np.fft.rfft(force, size), np.fft.rfft(outputs, size)
     correlations = np.abs(np.fft.irfft(force_spectrum * output_spectra.conj(), size)).max(axis=1)
     scale = np.linalg.norm(force) * np.linalg.norm(outputs, axis=1)
-    return bool((correlations > EXCITATION.follows * scale).any())
+    return bool((correlations > EXCITATION.max_correlation * scale).any())
 
 
 def begin_at_rest(records: Sequence[Record]) -> bool:
@@ -147,8 +148,8 @@ def begin_at_rest(records: Sequence[Record]) -> bool:
 
 def _begins_at_rest(record: Record) -> bool:
     n = int(np.argmax(record.inputs.any(axis=0)))  # samples before the first force
-    if n < EXCITATION.fewest or record.n_samples < 2 * n:
+    if n < EXCITATION.min_rest_samples or record.n_samples < 2 * n:
         return False
     parts = record.outputs[:, : record.n_samples // n * n].reshape(record.n_outputs, -1, n)
     first, *others = parts.var(axis=2).T
-    return bool((first <= (1.0 + EXCITATION.louder * np.sqrt(2.0 / n)) * np.min(others, axis=0)).all())
+    return bool((first <= (1.0 + EXCITATION.variance_deviations * np.sqrt(2.0 / n)) * np.min(others, axis=0)).all())

@@ -27,16 +27,19 @@ class HeldOutSettings:
 
     # ratio of the squared errors without and with these modes, below which they are removed. In sensor noise alone the
     # removal of true modes multiplies the error, and that of needless ones changes it by less than a tenth
-    worse: float = 0.8
-    least: float = 0.1  # share of the energy of the stronger mode that either half must hold
-    rows: int = 4  # samples of a half for each column of a fit, at least
+    max_error_ratio: float = 0.8
+    min_half_share: float = 0.1  # share of the energy of the stronger mode that either half must hold
+    rows_per_column: int = 4  # samples of a half for each column of a fit, at least
     # mean residual power near the modes over the median of all lines, and over the mean below or above them, that it
     # must exceed. Smaller residuals are noise; two modes a line apart, which half a record cannot resolve, may be true
-    loud: float = 10.0
-    free: float = 4.0 / 3.0  # degrees of freedom of a line with Hann's window, which correlates neighbours
-    faint: float = 0.01  # of the power of the outputs: a mode below it, without others about it, is tested as a line
-    matters: float = 1e-3  # of the response about a mode, 3 % of its amplitude: a larger residual is remarked
-    beside: float = 0.03  # of the largest residual about any mode, likewise: least squares spread up to 0.01 of it
+    min_residual_ratio: float = 10.0
+    degrees_per_line: float = 4.0 / 3.0  # of freedom of a line with Hann's window, which correlates neighbours
+    # of the power of the outputs: a mode below it, without others about it, is tested as a line
+    faint_share: float = 0.01
+    # of the response about a mode, 3 % of its amplitude: a larger residual is remarked
+    min_share: float = 1e-3
+    # of the largest residual about any mode, likewise: least squares spread up to 0.01 of it
+    peak_share: float = 0.03
 
 
 HELD_OUT = HeldOutSettings()
@@ -51,7 +54,7 @@ def without_unpredictive(
     are undamped within the record are tested one by one: each fits a single line.
     """
     n, omega = fit.poles.size, fit.poles.imag
-    reach = CHANGING.reach * omega
+    reach = CHANGING.frequency_range * omega
     weaker_near = (np.abs(np.subtract.outer(omega, omega)) < reach[:, None]) & (strength < strength[:, None])
     undamped = -fit.poles.real < 0.5 * data.resolution
     shortest = min(record.n_samples // 2 for record in data.records)
@@ -59,7 +62,7 @@ def without_unpredictive(
         return fit, ()
     whole = replace(data, line_std=None, beside=None, changing=())
     half = replace(whole, records=[_first_half(record) for record in whole.records])
-    too_short = len(half.values) < HELD_OUT.rows * (2 * n + half.fixed.shape[1])
+    too_short = len(half.values) < HELD_OUT.rows_per_column * (2 * n + half.fixed.shape[1])
     if too_short or half.fixed.shape[1] != whole.fixed.shape[1]:  # inputs that are zero throughout a first half
         return fit, ()
     all_modes = projected(whole, fit.poles, fit.participation)
@@ -98,7 +101,7 @@ def without_unpredictive(
         band = omega[group].min() - 0.5 * reach[r], omega[group].max() + 0.5 * reach[r]
         if not residual_of_all.stands_out(*band):
             continue
-        if error(kept & ~group, *band) < HELD_OUT.worse * error(kept, *band):
+        if error(kept & ~group, *band) < HELD_OUT.max_error_ratio * error(kept, *band):
             kept &= ~group
             if kept[r]:
                 distorted.append(complex(fit.poles[r]))
@@ -116,7 +119,7 @@ def _is_in_both(data: KnownInputs, fit: Fit, r: int) -> bool:
     """Whether both halves of the records hold a fair share of the energy of mode r."""
     powers = [np.abs(z) ** 2 for z in data.modal_coordinate(fit.poles[r], fit.participation[r])]
     halves = [(float(power[: power.size // 2].sum()), float(power[power.size // 2 :].sum())) for power in powers]
-    return sum(map(min, halves)) > HELD_OUT.least * sum(map(sum, halves))
+    return sum(map(min, halves)) > HELD_OUT.min_half_share * sum(map(sum, halves))
 
 
 def _is_faint(data: KnownInputs, fit: Fit, r: int) -> bool:
@@ -124,7 +127,7 @@ def _is_faint(data: KnownInputs, fit: Fit, r: int) -> bool:
     z = np.concatenate(data.modal_coordinate(fit.poles[r], fit.participation[r]))
     power = np.abs(fit.amplitudes[:, r]) ** 2 * 0.5 * (np.abs(z) ** 2).mean()
     outputs = np.hstack([record.outputs[:, data.first :] for record in data.records])
-    return bool((power < HELD_OUT.faint * outputs.var(axis=1)).all())
+    return bool((power < HELD_OUT.faint_share * outputs.var(axis=1)).all())
 
 
 def _power(samples: Floats) -> Floats:
@@ -154,13 +157,14 @@ class _ResidualSpectra:
         It must exceed the median of all lines, and the band of equal width below or above.
         """
         inside, width = _between(self.lines, self.highest, lowest, highest), highest - lowest
-        if not inside.size or inside.mean() < HELD_OUT.loud * self.usual:
+        if not inside.size or inside.mean() < HELD_OUT.min_residual_ratio * self.usual:
             return False
         for first in (lowest - width, highest):  # noise may be coloured
             beside = _between(self.lines, self.highest, first, first + width)
             if beside.size:
-                chance = variance_ratio.isf(FALSE_ALARM, HELD_OUT.free * inside.size, HELD_OUT.free * beside.size)
-                if inside.mean() > max(HELD_OUT.loud, chance) * beside.mean():
+                degrees = (HELD_OUT.degrees_per_line * each.size for each in (inside, beside))
+                chance = variance_ratio.isf(FALSE_ALARM, *degrees)
+                if inside.mean() > max(HELD_OUT.min_residual_ratio, chance) * beside.mean():
                     return True
         return False
 
@@ -177,9 +181,9 @@ def left_about(data: KnownInputs, fit: Fit) -> tuple[complex, ...]:
     """
     whole = replace(data, line_std=None, beside=None, changing=())
     spectra = _ResidualSpectra(whole, projected(whole, fit.poles, fit.participation))
-    bands = fit.poles.imag[:, None] * (1.0 + 0.5 * CHANGING.reach * np.array([-1.0, 1.0]))
+    bands = fit.poles.imag[:, None] * (1.0 + 0.5 * CHANGING.frequency_range * np.array([-1.0, 1.0]))
     residual, response = np.array([spectra.between(*band) for band in bands]).reshape(-1, 2).T
-    significant = residual > np.maximum(HELD_OUT.matters * response, HELD_OUT.beside * residual.max(initial=0.0))
+    significant = residual > np.maximum(HELD_OUT.min_share * response, HELD_OUT.peak_share * residual.max(initial=0.0))
     return tuple(complex(fit.poles[r]) for r in np.flatnonzero(significant) if spectra.stands_out(*bands[r]))
 
 

@@ -35,12 +35,12 @@ class DelaysSettings:
     """Constants of the estimation of delays."""
 
     rounds: int = 4  # of delays of band-limited inputs and the modes of a subspace model
-    most_lags: int = 60  # of the ARX model
-    rows_each: int = 8  # rows for each of its coefficients, at least
-    part: int = 4096  # rows of the data matrix held at once
+    max_lags: int = 60  # of the ARX model
+    row_ratio: int = 8  # rows for each of its coefficients, at least
+    block_rows: int = 4096  # of the data matrix held at once
     round_off: float = 1e-8  # of the ratio of an output to an input
-    real_modes: float = 1.0  # weight of the phase of the modes beside the χ² of the columns
-    known: float = 100.0  # χ² of a mode at which it has half of that weight
+    phase_weight: float = 1.0  # of the phase of the modes beside the χ² of the columns
+    half_weight_statistic: float = 100.0  # χ² of a mode at which it has half of that weight
 
 
 DELAYS = DelaysSettings()
@@ -126,7 +126,7 @@ def _with_best_delays(data: KnownInputs, fit: Fit, time_limit: TimeLimit) -> tup
         other = data.delayed_by(np.where(np.arange(delays.size) == i, delay, delays))
         moved = _for_other_delays(other, data, fit)
         phases, weight_of_phase = _phases(other, moved)
-        real_modes = DELAYS.real_modes * float((weight_of_phase * np.cos(2.0 * phases)).sum())
+        real_modes = DELAYS.phase_weight * float((weight_of_phase * np.cos(2.0 * phases)).sum())
         return other.cost(moved) * len(fit.residual) / len(moved.residual) - real_modes
 
     delays = data.delays.copy()
@@ -136,7 +136,7 @@ def _with_best_delays(data: KnownInputs, fit: Fit, time_limit: TimeLimit) -> tup
         # interpolation spreads a band-limited input ahead of its delay, so the first lag is too early
         whole = max(float(delays[i]), 0.0)
         middle_cost, after = at(whole), at(whole + 1.0)
-        while after < middle_cost and whole < DELAYS.most_lags and not time_limit.spent(DELAY_SEARCH):
+        while after < middle_cost and whole < DELAYS.max_lags and not time_limit.spent(DELAY_SEARCH):
             whole, middle_cost, after = whole + 1.0, after, at(whole + 2.0)
         lowest = max(whole - 1.0, 0.0)
         best = minimize_scalar(at, bounds=(lowest, whole + 1.0), method="bounded", options={"xatol": 1e-3})
@@ -170,25 +170,25 @@ def _first_lags(records: Sequence[Record]) -> np.ndarray:
     rows = sum(record.n_samples for record in records)
     moved = n_moving(records)  # impulses are too short to show lags
     shortest = min(record.n_samples for record in records)
-    lags = min(DELAYS.most_lags, rows // (DELAYS.rows_each * (m + q)), moved // DELAYS.rows_each, shortest // 4)
+    lags = min(DELAYS.max_lags, rows // (DELAYS.row_ratio * (m + q)), moved // DELAYS.row_ratio, shortest // 4)
     if lags < 3:
         return np.zeros(q, int)
     size = lags * m + (lags + 1) * q
     gram, moment, squares = np.zeros((size, size)), np.zeros((size, m)), np.zeros((m, m))
     for record in records:
         y = record.outputs - record.outputs.mean(axis=1, keepdims=True)
-        for first in range(lags, record.n_samples, DELAYS.part):
-            at = np.arange(first, min(first + DELAYS.part, record.n_samples))
+        for first in range(lags, record.n_samples, DELAYS.block_rows):
+            at = np.arange(first, min(first + DELAYS.block_rows, record.n_samples))
             past = [y[:, at - k] for k in range(1, lags + 1)] + [record.inputs[:, at - k] for k in range(lags + 1)]
             x, present = np.vstack(past), y[:, at]
             gram += x @ x.T
             moment += x @ present.T
             squares += present @ present.T
-    gram[np.diag_indices_from(gram)] += ORDER.floor**2 * np.diag(gram) + 1e-300
+    gram[np.diag_indices_from(gram)] += ORDER.noise_floor**2 * np.diag(gram) + 1e-300
     scale = 1.0 / np.sqrt(np.diag(gram))
     factor = cho_factor(gram * np.outer(scale, scale))
     coefficients = scale[:, None] * cho_solve(factor, scale[:, None] * moment)
-    residual_squares = squares - coefficients.T @ moment + ORDER.floor**2 * np.diag(np.diag(squares))
+    residual_squares = squares - coefficients.T @ moment + ORDER.noise_floor**2 * np.diag(np.diag(squares))
     variance = np.diag(cho_solve(factor, np.eye(size))) * scale**2
     b, free = coefficients[lags * m :], max(rows - lags * len(records) - size, 1)
     statistic = np.einsum("kj,kj->k", b, np.linalg.solve(residual_squares / free, b.T).T) / variance[lags * m :]
@@ -230,7 +230,7 @@ def _fractions(data: KnownInputs, fit: Fit) -> Floats:
         else:
             cost[k] = ((deviation / noise) ** 2).sum(axis=(0, 2))
         phases = 2.0 * (phase + fit.poles.imag[:, None] * f * data.dt)
-        cost[k] -= DELAYS.real_modes * (weight_of_phase * np.cos(phases)).sum(axis=0)
+        cost[k] -= DELAYS.phase_weight * (weight_of_phase * np.cos(phases)).sum(axis=0)
     return np.where(_act_later(data, fit), FRACTIONS[np.argmin(cost, axis=0)], 0.0)
 
 
@@ -241,7 +241,7 @@ def _phases(data: KnownInputs, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     mean_phase = np.exp(-0.5j * np.angle((displacements**2).sum(axis=0)))
     statistic = statistic_of_each(fit)
     size = np.abs(fit.participation[:, :q]) ** 2
-    weight = (statistic / (statistic + DELAYS.known))[:, None] * size / size.sum(axis=1, keepdims=True)
+    weight = (statistic / (statistic + DELAYS.half_weight_statistic))[:, None] * size / size.sum(axis=1, keepdims=True)
     return np.angle(1j * fit.participation[:, :q] / mean_phase[:, None]), weight
 
 

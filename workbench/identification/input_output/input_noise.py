@@ -42,15 +42,16 @@ from workbench.records.record import Record
 class InputNoiseSettings:
     """Constants of the estimation of the noise of the inputs."""
 
-    same: float = 0.02  # relative change of the outputs' noise at any line, below which its estimation ends
-    steps: int = 60  # of the iteration for the levels, at most
-    settled: float = 1e-3  # relative change of the level of each input, below which the iteration ends
-    band: int = 64  # lines over which the spectrum of an input is averaged for its minimum
-    least: float = 1.5  # times that minimum: upper bound of the noise; such an average scatters by a sixth
-    about: float = 2.0  # half bandwidths to either side of a mode: its lines
-    lines: int = 6  # to either side, at least
-    chance: float = 1e-4  # that noise of the estimated level leaves as much at a mode as is observed
-    faintest: float = 0.05  # of the estimated level: least residual at a mode, of which the fit absorbs a part
+    colour_tolerance: float = 0.02  # relative change of the outputs' noise at any line, below which its estimation ends
+    max_iterations: int = 60  # of the iteration for the levels, at most
+    level_tolerance: float = 1e-3  # relative change of the level of each input, below which the iteration ends
+    band_lines: int = 64  # lines over which the spectrum of an input is averaged for its minimum
+    max_noise_ratio: float = 1.5  # times that minimum: upper bound of the noise; such an average scatters by a sixth
+    half_bandwidths: float = 2.0  # to either side of a mode: its lines
+    min_margin_lines: int = 6  # to either side, at least
+    residual_probability: float = 1e-4  # that noise of the estimated level leaves as much at a mode as is observed
+    # of the estimated level: least residual at a mode, of which the fit absorbs a part
+    min_residual_ratio: float = 0.05
 
 
 INPUT_NOISE = InputNoiseSettings()
@@ -86,11 +87,11 @@ def input_noise(data: KnownInputs, fit: Fit) -> InputNoise | None:
         return None
     n_modes = 0
     for pole in fit.poles:
-        width = max(INPUT_NOISE.about * abs(pole.real), INPUT_NOISE.lines * 0.5 * data.resolution)
+        width = max(INPUT_NOISE.half_bandwidths * abs(pole.real), INPUT_NOISE.min_margin_lines * 0.5 * data.resolution)
         near_mode = np.abs(frequencies - pole.imag) < width
         if (input_part[:, near_mode].mean(axis=1) > sensor_part[:, near_mode].mean(axis=1)).any():
-            upper = chi2.isf(INPUT_NOISE.chance, near_mode.sum()) / near_mode.sum()
-            if not INPUT_NOISE.faintest < (power[:, near_mode] / total[:, near_mode]).mean() < upper:
+            upper = chi2.isf(INPUT_NOISE.residual_probability, near_mode.sum()) / near_mode.sum()
+            if not INPUT_NOISE.min_residual_ratio < (power[:, near_mode] / total[:, near_mode]).mean() < upper:
                 return None
             n_modes += 1
     return noise if n_modes > 1 else None
@@ -116,10 +117,10 @@ def _noise_bound(records: Sequence[Record]) -> Floats:
     lowest = np.full(records[0].n_inputs, np.inf)
     for record in records:
         power = lines_of(record.inputs.T - record.inputs.mean(axis=1)) ** 2
-        n = max(len(power) // INPUT_NOISE.band, 1)
+        n = max(len(power) // INPUT_NOISE.band_lines, 1)
         bands = [band.mean(axis=0) for band in np.array_split(power, n)]
         lowest = np.minimum(lowest, np.min(bands, axis=0))
-    return np.sqrt(INPUT_NOISE.least * lowest)
+    return np.sqrt(INPUT_NOISE.max_noise_ratio * lowest)
 
 
 def _frequencies(data: KnownInputs) -> Floats:
@@ -147,7 +148,7 @@ def _likeliest_noise(data: KnownInputs, lines: Floats, gain: Floats, highest: Fl
         own = lines * np.sqrt(sensor_part / (sensor_part + np.tensordot(noise.inputs**2, gain, 1)))
         filters = tuple(autoregression(_by_record(data, output), most)[0] for output in own)
         before, colour = colour, replace(noise, innovations=np.ones(len(lines)), filters=filters).sensors_at(phase)
-        if np.allclose(colour, before, rtol=INPUT_NOISE.same):
+        if np.allclose(colour, before, rtol=INPUT_NOISE.colour_tolerance):
             break
     return noise
 
@@ -162,14 +163,14 @@ def _likeliest_levels(power: Floats, gain: Floats, highest: Floats) -> tuple[Flo
     of_outputs = 0.5 * power.mean(axis=1)
     of_inputs = 0.5 * power.mean() / np.maximum(gain.mean(axis=(1, 2)), 1e-300) / len(gain)
     floor = PROJECTION.noise_free_ratio**2 * of_outputs + 1e-300
-    for _ in range(INPUT_NOISE.steps):
+    for _ in range(INPUT_NOISE.max_iterations):
         total = of_outputs[:, None] + np.tensordot(of_inputs, gain, 1)
         inverse = 1.0 / total
         weighted_power = power * inverse**2
         step = np.tensordot(gain, weighted_power) / np.maximum(np.tensordot(gain, inverse), 1e-300)
         of_outputs = np.maximum(of_outputs * weighted_power.sum(axis=1) / inverse.sum(axis=1), floor)
         of_inputs = of_inputs * step
-        if np.abs(step - 1.0).max() < INPUT_NOISE.settled:
+        if np.abs(step - 1.0).max() < INPUT_NOISE.level_tolerance:
             break
     return np.minimum(np.sqrt(of_inputs), highest), np.sqrt(of_outputs)
 
@@ -195,7 +196,7 @@ def _expected_inputs(record: Record, noise: InputNoise) -> Record:
     """
     level = record.inputs.mean(axis=1)
     lines = lines_of(record.inputs.T - level)
-    measured_power = uniform_filter1d(lines**2, INPUT_NOISE.band, axis=0, mode="nearest")
+    measured_power = uniform_filter1d(lines**2, INPUT_NOISE.band_lines, axis=0, mode="nearest")
     kept = np.maximum(1.0 - noise.inputs**2 / np.maximum(measured_power, 1e-300), 0.0)
     return replace(record, inputs=(samples_of(kept * lines) + level).T)
 

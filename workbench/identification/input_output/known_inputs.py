@@ -57,8 +57,8 @@ from workbench.records.record import Record
 from workbench.threads import at_once
 
 # φ_k(x) = Σ x^i / (i + k)!; its last term is below rounding for |x| < 6. Below Nyquist |Im λΔt| < π.
-TERMS = 40
-SERIES = [np.array([1.0 / factorial(i + k) for i in range(TERMS)]) for k in (1, 2)]
+SERIES_TERMS = 40
+SERIES = [np.array([1.0 / factorial(i + k) for i in range(SERIES_TERMS)]) for k in (1, 2)]
 
 
 @dataclass(eq=False, repr=False)
@@ -75,9 +75,8 @@ class KnownInputs:
     hold: str
     feedthrough: bool
     delays: np.ndarray = field(default_factory=lambda: np.zeros(1))  # (n_inputs,) samples
-    any_fraction: bool = (
-        False  # unknown fractions of a sample beyond `delays`: each input has the columns u_k and u_k-1
-    )
+    # unknown fractions of a sample beyond `delays`: each input has the columns u_k and u_k-1
+    any_fraction: bool = False
     drift: int = 0  # degree of the polynomials of time that each output of each record holds
     line_std: Sequence[np.ndarray] | None = None  # relative noise of lines, (n_rows, n_outputs) a record, of unit rms
     beside: Floats | None = None  # (n_samples, n_columns) of all records, further fixed columns
@@ -473,8 +472,8 @@ def _resampled(line_std: np.ndarray, n_rows: int) -> np.ndarray:
 def sources(pole: complex, dt: float, hold: str) -> tuple[tuple[complex, complex], tuple[complex, complex]]:
     """(c_0, c_1) of a zero- or first-order hold, and their derivatives by λ."""
     x = pole * dt
-    powers = x ** np.arange(TERMS)
-    sums: list[Any] = [(s @ powers, s[1:] * np.arange(1, TERMS) @ powers[:-1]) for s in SERIES]
+    powers = x ** np.arange(SERIES_TERMS)
+    sums: list[Any] = [(s @ powers, s[1:] * np.arange(1, SERIES_TERMS) @ powers[:-1]) for s in SERIES]
     (phi1, phi1_slope), (phi2, phi2_slope) = sums
     if hold == "zero":
         return (dt * phi1, 0.0), (dt**2 * phi1_slope, 0.0)

@@ -17,8 +17,8 @@ from workbench.arrays import Complexes, Floats
 
 Sources = tuple[tuple[complex, complex], tuple[complex, complex]]
 # of the distance of lines: a pole closer than this to a line makes both sides above lose their digits
-LEAST_DISTANCE = 1e-4
-FORGOTTEN = 40.0  # nepers by which a free motion has decayed below rounding
+MIN_DISTANCE = 1e-4
+FORGOTTEN_NEPERS = 40.0  # by which a free motion has decayed below rounding
 
 
 class LinesOfPoles:
@@ -46,7 +46,7 @@ class LinesOfPoles:
         """Whether a pole is so near to one of the lines that its response has no accurate closed form."""
         spacing = np.pi / self.size
         line = np.round(pole.imag * self.dt / spacing) * spacing
-        return bool(abs(1.0 - np.exp(pole * self.dt - 1j * line)) < LEAST_DISTANCE * spacing)
+        return bool(abs(1.0 - np.exp(pole * self.dt - 1j * line)) < MIN_DISTANCE * spacing)
 
     def tangents(
         self, pole: complex, held: Sources, rows: np.ndarray, participation: Complexes, real: Floats, imaginary: Floats
@@ -59,7 +59,7 @@ class LinesOfPoles:
         m, n = np.exp(pole * self.dt), self.inputs.shape[1]
         factors = np.array([m, *held[0], self.dt * m, *held[1]], complex)
         # what acts before is forgotten to rounding by the last sample
-        reach = int(min(FORGOTTEN / max(-pole.real * self.dt, FORGOTTEN / n), n))
+        reach = int(min(FORGOTTEN_NEPERS / max(-pole.real * self.dt, FORGOTTEN_NEPERS / n), n))
         ends = _ends(self.inputs, self.first, n - reach, factors)
         if not self.at_rest:
             before, after = m**self.first, -(m**n)

@@ -28,11 +28,11 @@ Pair = tuple[np.ndarray, np.ndarray]
 # From this many rows on, the Gram matrix is that of the tangents less that of their projections: to form the projected
 # tangents takes three times as long, and the rounding error of the difference is below the noise of so many rows
 MANY_ROWS = 5000
-BLOCK = 8192  # rows at a time: these stay in the processor's cache, and are as many tasks for its cores
+BLOCK_ROWS = 8192  # rows at a time: these stay in the processor's cache, and are as many tasks for its cores
 # Length of a unit column orthogonal to the others, below which Cholesky factors lose it in rounding
-LEAST_INDEPENDENT = 1e-5
+MIN_ORTHOGONAL_LENGTH = 1e-5
 # The same where only products of the columns are known, whose rounding error grows with its inverse square
-LEAST_INDEPENDENT_OF_PRODUCTS = 1e-3
+MIN_LENGTH_OF_PRODUCTS = 1e-3
 
 
 class Measurement(Protocol):
@@ -213,7 +213,7 @@ def _parts_by_products(data: Measurement, x: np.ndarray, combined: np.ndarray) -
         of_columns = with_columns @ combined
         size = np.maximum(np.sqrt(np.diag(of_columns)), 1e-300)
         factor = np.linalg.cholesky(of_columns / np.outer(size, size)).T
-        if factor.size and np.diag(factor).min() < LEAST_INDEPENDENT_OF_PRODUCTS:
+        if factor.size and np.diag(factor).min() < MIN_LENGTH_OF_PRODUCTS:
             raise np.linalg.LinAlgError("columns that are nearly dependent")
         inverse = solve_triangular(factor, np.eye(size.size)) / size[:, None]
         qt, qy = inverse.T @ with_columns[:, t], inverse.T @ (combined.T @ moments)
@@ -252,7 +252,7 @@ def _left(x: Floats, weight: Floats, y: Floats, coefficients: Floats) -> tuple[F
 
 def blocks(n_rows: int) -> list[slice]:
     """Rows at a time."""
-    return [slice(first, min(first + BLOCK, n_rows)) for first in range(0, n_rows, BLOCK)]
+    return [slice(first, min(first + BLOCK_ROWS, n_rows)) for first in range(0, n_rows, BLOCK_ROWS)]
 
 
 def added_misfit(fewer: Fit, more: Fit, noise: np.ndarray) -> float:
@@ -295,7 +295,7 @@ def orthonormal(columns: np.ndarray) -> Pair:
     try:
         for _ in range(2):
             r = np.linalg.cholesky(q.T @ q).T
-            if r.size and np.diag(r).min() < LEAST_INDEPENDENT:
+            if r.size and np.diag(r).min() < MIN_ORTHOGONAL_LENGTH:
                 raise np.linalg.LinAlgError("columns that are nearly dependent")
             q, r_total = q @ solve_triangular(r, np.eye(r.shape[0])), r @ r_total
     except np.linalg.LinAlgError:

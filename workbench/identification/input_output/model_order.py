@@ -12,8 +12,8 @@ from scipy.stats import chi2
 from workbench.arrays import Floats
 from workbench.identification.input_output.fit_errors import marginal_statistics_of, statistic_of, statistic_of_each
 from workbench.identification.input_output.modal_fit import (
-    LEAST_INDEPENDENT_OF_PRODUCTS,
     MANY_ROWS,
+    MIN_LENGTH_OF_PRODUCTS,
     Fit,
     Measurement,
     Part,
@@ -37,13 +37,15 @@ from workbench.threads import at_once
 class OrderSettings:
     """Constants of the model order selection of a measurement, beside those of `searches.SELECTION`."""
 
-    most_weak: int = 3  # consecutive candidates below the threshold, after which the search ends
+    max_weak_candidates: int = 3  # consecutive candidates below the threshold, after which the search ends
     steps: int = 20  # of the fit by which a mode enters
-    enter: float = 0.5  # of the threshold, at which a candidate is fitted: its participation factors are approximate
-    distinct: float = 10.0  # times the threshold: two close modes, each above it, are not tested for removal
-    apart: float = 10.0  # decay rates: a candidate nearer to a mode is fitted with it, not alone
-    floor: float = 1e-5  # noise floor of each output, relative: -100 dB
-    collinear: float = 1e-10  # of the energy of each column, added so that coincident poles leave no singular matrix
+    # of the threshold, at which a candidate is fitted: its participation factors are approximate
+    entry_ratio: float = 0.5
+    distinct_ratio: float = 10.0  # times the threshold: two close modes, each above it, are not tested for removal
+    min_distance: float = 10.0  # decay rates: a candidate nearer to a mode is fitted with it, not alone
+    noise_floor: float = 1e-5  # noise floor of each output, relative: -100 dB
+    # of the energy of each column, added so that coincident poles leave no singular matrix
+    regularisation: float = 1e-10
     # distorted_rates, distorted_share: decay rates, and share of the frequency, to either side of a nonlinear mode,
     # within which no further mode is searched: the distortion of a spring that hardens by 3 % fills five bandwidths
     distorted_rates: float = 10.0
@@ -89,7 +91,7 @@ def select_modes(
     """
     problem = _Modes(data, options)
     selection = OrderSelection(
-        problem, options.max_modes, ORDER.most_weak, None, forgets=True, time_limit=options.time_limit
+        problem, options.max_modes, ORDER.max_weak_candidates, None, forgets=True, time_limit=options.time_limit
     )
     fit = projected(data, np.zeros(0, complex), np.zeros((0, problem.excitations), complex))
     if start is not None and is_tested:
@@ -123,12 +125,12 @@ def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float) -> Fi
     for weights, y in zip(weights_of(data), together, strict=True):
         gram, moments = products_of(columns, weights, y)
         gram /= np.outer(scale, scale)
-        gram[np.diag_indices_from(gram)] *= 1.0 + ORDER.collinear
+        gram[np.diag_indices_from(gram)] *= 1.0 + ORDER.regularisation
         spreads.append(np.linalg.inv(gram))
         coefficients.append(spreads[-1] @ (moments / scale[:, None]))
         rss = ((y - weights * (columns @ (coefficients[-1] / scale[:, None]))) ** 2).sum(axis=0)
         variance = rss / max(len(columns) - columns.shape[1], 1)
-        variances.append(np.maximum(variance, ORDER.floor**2 * (y**2).mean(axis=0)))
+        variances.append(np.maximum(variance, ORDER.noise_floor**2 * (y**2).mean(axis=0)))
     limit = chi2.isf(false_alarm / data.cells, size * data.values.shape[1])
     while poles.size:
         blocks = np.arange(poles.size * size).reshape(poles.size, size)
@@ -213,7 +215,7 @@ class _Modes:
         if not candidates:
             return None
         strength, participation, pole = max(candidates, key=lambda item: item[0])
-        return None if strength < ORDER.enter * self.threshold(model, pole) else (pole, participation)
+        return None if strength < ORDER.entry_ratio * self.threshold(model, pole) else (pole, participation)
 
     def _gains(self, model: Fit, poles: np.ndarray, together: int = 16) -> Iterator[tuple[float, np.ndarray]]:
         """`_candidate_gains`, two times so many poles at a time: a basis is read from memory once for many."""
@@ -256,7 +258,7 @@ class _Modes:
 
         def are_near(pole: complex) -> np.ndarray:
             rates = np.maximum(np.abs(model.poles.real), abs(pole.real))
-            return np.asarray(np.abs(model.poles - pole) < ORDER.apart * np.maximum(rates, data.resolution))
+            return np.asarray(np.abs(model.poles - pole) < ORDER.min_distance * np.maximum(rates, data.resolution))
 
         near = np.append(np.flatnonzero(are_near(pole)), n)
         if len(data.values) >= MANY_ROWS and near.size <= n:
@@ -318,7 +320,7 @@ class _Modes:
             distance = np.abs(np.delete(model.poles, r) - pole).min(initial=np.inf)
             is_close = distance < SELECTION.close_bandwidths * abs(pole.real)
             threshold = self.threshold(model, pole)
-            doubtful = is_close and statistic[r] < ORDER.distinct * threshold
+            doubtful = is_close and statistic[r] < ORDER.distinct_ratio * threshold
             if spurious[r] or doubtful or statistic_of(model, r) < SELECTION.weak_ratio * threshold:
                 yield complex(pole), self._without(model, r), bool(spurious[r])
 
@@ -444,7 +446,7 @@ def basis_of(phi: Floats, part: Part) -> Floats:
     if len(phi) >= MANY_ROWS:
         try:
             factor = np.linalg.cholesky(part.spread / np.outer(size, size))
-            if np.diag(factor).min(initial=1.0) > LEAST_INDEPENDENT_OF_PRODUCTS:
+            if np.diag(factor).min(initial=1.0) > MIN_LENGTH_OF_PRODUCTS:
                 return np.asarray(phi @ (size[:, None] * factor))
         except np.linalg.LinAlgError:
             pass

@@ -28,10 +28,11 @@ from workbench.records.record import Record
 class OutputClockSettings:
     """Constants of the search for a clock of the outputs of its own."""
 
-    sure: float = 8.0  # standard errors that ε must exceed; 3 where the stiffness falls by 3 % and the clock is one
+    standard_errors: float = 8.0  # that ε must exceed; 3 where the stiffness falls by 3 % and the clock is one
     # share of the residual that resampling must remove: of 6000 samples with 1 % noise, 0.6 at 10 ppm, 0.98 at 200 ppm
-    explained: float = 0.3
-    most: float = 0.002  # largest |ε|: clocks of quartz differ by 0.0002, and beyond this a sample rate is misstated
+    min_removed_share: float = 0.3
+    # largest |ε|: clocks of quartz differ by 0.0002, and beyond this a sample rate is misstated
+    max_rate: float = 0.002
     rounds: int = 6  # of resampling; 3 suffice for 500 ppm
 
 
@@ -85,11 +86,11 @@ def on_one_clock(
     if jumps or not fit.poles.size:
         return None
     clock, rate, left = output_clock(data, fit), 0.0, 1.0
-    if abs(clock.rate) < OUTPUT_CLOCK.sure * clock.std:
+    if abs(clock.rate) < OUTPUT_CLOCK.standard_errors * clock.std:
         return None
     for _ in range(OUTPUT_CLOCK.rounds):
         rate += (1.0 + rate) * clock.rate
-        if abs(rate) > OUTPUT_CLOCK.most or time_limit.spent("search for a clock of the outputs of its own"):
+        if abs(rate) > OUTPUT_CLOCK.max_rate or time_limit.spent("search for a clock of the outputs of its own"):
             return None
         on_one = [on_inputs_clock(record, rate) for record in data.records]
         resampled = replace(data, records=on_one, clock=rate, line_std=None)
@@ -100,7 +101,7 @@ def on_one_clock(
         # the least of all rounds: where the frequencies change too, the modes that are sure differ from round to round
         left = min(left, float(np.mean((other.noise / fit.noise) ** 2)))
         if abs(clock.rate) < clock.std:
-            return (resampled, other) if left < 1.0 - OUTPUT_CLOCK.explained else None
+            return (resampled, other) if left < 1.0 - OUTPUT_CLOCK.min_removed_share else None
     return None
 
 

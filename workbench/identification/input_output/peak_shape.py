@@ -29,12 +29,12 @@ from workbench.identification.input_output.spectral_lines import Lines
 class PeaksSettings:
     """Constants of the detection of distorted peaks and of clusters."""
 
-    false_alarm: float = 1e-6  # chance that noise alone makes such a peak
-    matters: float = 0.2  # of the half-power half-width: a smaller scatter of the pole is negligible
-    beside: float = 4.0  # half-power half-widths about a mode in which its noise is measured
-    fewest: int = 3  # modes of a cluster: two modes of one structure may overlap
-    in_phase: float = 0.95  # modal phase collinearity of overlapping modes of proportional damping
-    narrow: float = 3.0  # half-power bands of the strongest mode: broader modes do not extend the cluster
+    false_alarm_probability: float = 1e-6  # chance that noise alone makes such a peak
+    min_scatter: float = 0.2  # of the half-power half-width: a smaller scatter of the pole is negligible
+    noise_half_widths: float = 4.0  # half-power ones about a mode in which its noise is measured
+    min_cluster_size: int = 3  # modes of a cluster: two modes of one structure may overlap
+    min_collinearity: float = 0.95  # modal phase collinearity of overlapping modes of proportional damping
+    max_width: float = 3.0  # half-power bands of the strongest mode: broader modes do not extend the cluster
 
 
 PEAKS = PeaksSettings()
@@ -75,13 +75,13 @@ def peaks(lines: Lines, fit: Fit) -> Peaks:
     uneven, scatter, statistic = np.zeros(n, bool), np.zeros(n), np.zeros(n)
     for r, pole in enumerate(fit.poles):
         pair = np.array([r, 2 * n + r])
-        near = np.abs(lines.omega - pole.imag) < max(PEAKS.beside * abs(pole.real), PEAKS.beside * lines.resolution)
+        near = np.abs(lines.omega - pole.imag) < PEAKS.noise_half_widths * max(abs(pole.real), lines.resolution)
         noise_ratio = max(1.0, float(power[near].mean())) if near.any() else 1.0
         value = coefficients[pair]
         statistic[r] = value @ np.linalg.pinv(covariance[np.ix_(pair, pair)], hermitian=True) @ value
         scatter[r] = np.sqrt(np.hypot(*value) / size[r])
-        significant = statistic[r] > noise_ratio * chi2.isf(PEAKS.false_alarm, 2)
-        uneven[r] = significant and scatter[r] > PEAKS.matters * abs(pole.real)
+        significant = statistic[r] > noise_ratio * chi2.isf(PEAKS.false_alarm_probability, 2)
+        uneven[r] = significant and scatter[r] > PEAKS.min_scatter * abs(pole.real)
     return Peaks(uneven, scatter, statistic)
 
 
@@ -97,8 +97,8 @@ def parts_of(poles: np.ndarray, collinearity: np.ndarray, strength: np.ndarray) 
             neighbours = [r for r in remaining if overlap[r, member]]
             remaining = [r for r in remaining if r not in neighbours]
             cluster += [int(r) for r in neighbours]
-            to_extend += [r for r in neighbours if width[r] < PEAKS.narrow * width[first]]
-        if len(cluster) >= PEAKS.fewest and collinearity[cluster].min() < PEAKS.in_phase:
+            to_extend += [r for r in neighbours if width[r] < PEAKS.max_width * width[first]]
+        if len(cluster) >= PEAKS.min_cluster_size and collinearity[cluster].min() < PEAKS.min_collinearity:
             clusters[cluster[0]] = cluster[1:]
     return clusters
 

@@ -34,14 +34,14 @@ from workbench.records.record import Record
 class DrivenSelectionSettings:
     """Constants of the selection of modes of records with known inputs."""
 
-    strongest: int = 8  # modes for the first estimate of the noise
+    first_modes: int = 8  # modes for the first estimate of the noise
     noise_rounds: int = 4  # alternations between noise and modes
     decorrelation_rounds: int = 2  # selections of modes in combinations of outputs whose noise is uncorrelated
     spare_states: int = 20  # of a subspace model beyond two per mode: these fit noise
     drift_share: float = 0.2  # of the time left, for the modes without drift, and then for those beside it
     drift_degree: int = 3  # of the polynomials of time that represent the drift of a sensor
     drift_lines: int = 10  # the lowest of each output after removal of a straight line
-    stands_out: float = 10.0  # times the median of these that the energy of the straight line exceeds
+    min_drift_ratio: float = 10.0  # times the median of these that the energy of the straight line exceeds
 
 
 DRIVEN_SELECTION = DrivenSelectionSettings()
@@ -104,7 +104,7 @@ def subspace_start(data: KnownInputs, options: SelectionOptions) -> Fit:
 
 
 def select_strongest(data: KnownInputs, options: SelectionOptions, start: Fit | None = None) -> SelectedModes:
-    """The modes of `start`, or else of a subspace model, and further ones up to `DRIVEN_SELECTION.strongest`.
+    """The modes of `start`, or else of a subspace model, and further ones up to `DRIVEN_SELECTION.first_modes`.
 
     As long as all are sure, as many more are searched: strong modes left out would be taken for noise.
     """
@@ -119,12 +119,12 @@ def select_strongest(data: KnownInputs, options: SelectionOptions, start: Fit | 
         # beside the residual about each: noise of the inputs leaves peaks at the modes far above white noise
         if sure_modes(data, fit, options).poles.size < fit.poles.size:
             return selected
-        few = _few_of(options, few.max_modes + DRIVEN_SELECTION.strongest)
+        few = _few_of(options, few.max_modes + DRIVEN_SELECTION.first_modes)
 
 
 def _few_of(options: SelectionOptions, fewest: int) -> SelectionOptions:
-    """The options with at most `DRIVEN_SELECTION.strongest` modes, or `fewest` where these are more."""
-    return replace(options, max_modes=min(max(DRIVEN_SELECTION.strongest, fewest), options.max_modes))
+    """The options with at most `DRIVEN_SELECTION.first_modes` modes, or `fewest` where these are more."""
+    return replace(options, max_modes=min(max(DRIVEN_SELECTION.first_modes, fewest), options.max_modes))
 
 
 def only_predictive(data: KnownInputs, selected: SelectedModes, time_limit: TimeLimit) -> SelectedModes:
@@ -259,6 +259,6 @@ def _may_drift(records: Sequence[Record]) -> bool:
         slope = y @ t / (t @ t)
         lines = np.fft.rfft(y - slope[:, None] * t)[:, 1 : DRIVEN_SELECTION.drift_lines + 1]
         energy = np.abs(lines) ** 2 * 2.0 / record.n_samples
-        if (slope**2 * (t @ t) > DRIVEN_SELECTION.stands_out * np.median(energy, axis=1)).any():
+        if (slope**2 * (t @ t) > DRIVEN_SELECTION.min_drift_ratio * np.median(energy, axis=1)).any():
             return True
     return False

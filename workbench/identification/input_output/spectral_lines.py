@@ -18,17 +18,18 @@ from workbench.identification.signal.searches import SELECTION
 class LinesSettings:
     """Constants of the search among lines and of their noise."""
 
-    most_candidates: int = 600  # lines, the strongest, at which poles are tried
-    rates: int = 6  # number of decay rates tried
-    beside: int = 25  # lines on either side from which the noise about a pole is estimated
-    peaks_a_rate: int = 10  # candidates of each decay rate
-    louder: float = 0.01  # chance that noise of one level is taken for louder about a mode
-    uneven: float = 1e-4  # chance that noise of one level is taken for uneven
-    smoothed: int = 5  # lines of a running median
+    max_candidates: int = 600  # lines, the strongest, at which poles are tried
+    decay_rates: int = 6  # that are tried
+    noise_lines: int = 25  # lines on either side from which the noise about a pole is estimated
+    candidates_per_rate: int = 10  # of each decay rate
+    louder_probability: float = 0.01  # chance that noise of one level is taken for louder about a mode
+    uneven_probability: float = 1e-4  # chance that noise of one level is taken for uneven
+    median_lines: int = 5  # lines of a running median
     lags: int = 3  # lines, at which the correlation of windowed noise is estimated
     instants: int = 2000  # of a record, in the numerical integral of that correlation
-    windowed: float = 5.0  # standard errors of one output's correlation, above which there was a window
-    explained: float = 0.3  # of the deviation from noise without a window, that remains with the best window at most
+    window_deviations: float = 5.0  # standard errors of one output's correlation, above which there was a window
+    # of the deviation from noise without a window, that remains with the best window at most
+    max_deviation_share: float = 0.3
     degree: int = 3  # of the polynomial of log ω that noise follows along frequency
 
 
@@ -66,8 +67,8 @@ class Lines:
         # A pole close beyond the band is not constant in it, so such poles are searched too, as residual terms.
         self.highest, self.nyquist = 2.0 * float(omega[-1]), np.inf
         span = omega[-1] - omega[0]
-        self.rates = np.geomspace(0.3 * self.resolution, max(0.03 * span, self.resolution), LINES.rates)
-        self.cells = LINES.rates * n_lines
+        self.rates = np.geomspace(0.3 * self.resolution, max(0.03 * span, self.resolution), LINES.decay_rates)
+        self.cells = LINES.decay_rates * n_lines
         self.distorted: tuple[complex, ...] = ()
         self.free: tuple[complex, ...] = ()
 
@@ -122,18 +123,18 @@ class Lines:
         raw = self.unstacked(residual if self.weights is None else residual * self.weights).reshape(-1, self.omega.size)
         weight = 1.0 if self.weights is None else (np.abs(self.unstacked(self.weights)) ** 2).mean(axis=(0, 1)) / 2.0
         power = (np.abs(raw) ** 2).sum(axis=0)
-        lines = np.sort(np.argsort(power)[-LINES.most_candidates :])
+        lines = np.sort(np.argsort(power)[-LINES.max_candidates :])
         poles, strength = [], []
         for rate in self.rates:
             x = 1.0 / (1j * (self.omega - self.omega[lines, None]) + rate)
             score = (np.abs(raw @ x.conj().T) ** 2).sum(axis=0) / (np.abs(x) ** 2 * weight).sum(axis=1)
             score[rate > SELECTION.max_damping * self.omega[lines]] = 0.0
-            best = np.argsort(score)[-LINES.peaks_a_rate :]
+            best = np.argsort(score)[-LINES.candidates_per_rate :]
             poles.append(-rate + 1j * self.omega[lines[best]])
             strength.append(score[best])
         order = np.argsort(np.concatenate(strength))[::-1]
         outside = np.r_[0.6 * self.omega[0], 0.9 * self.omega[0], np.array([1.05, 1.2, 1.5]) * self.omega[-1]]
-        return np.asarray(np.r_[np.concatenate(poles)[order[: 3 * LINES.peaks_a_rate]], (-0.01 + 1j) * outside])
+        return np.asarray(np.r_[np.concatenate(poles)[order[: 3 * LINES.candidates_per_rate]], (-0.01 + 1j) * outside])
 
     def fitted(self, fit: Fit) -> np.ndarray:
         """The fitted FRFs at the lines, (n_outputs, n_references, n_lines)."""
@@ -178,13 +179,13 @@ class Lines:
                 continue
             power = np.mean(noise_ratio, axis=(0, 1)) @ output_weights / output_weights.sum()
             degrees = np.size(noise_ratio) / output_weights.size * output_weights.sum() ** 2 / (output_weights**2).sum()
-            ratios[r] = power if power > chi2.isf(LINES.louder, degrees) / degrees else 1.0
+            ratios[r] = power if power > chi2.isf(LINES.louder_probability, degrees) / degrees else 1.0
         return ratios
 
     def noise_ratio(self, residual: np.ndarray, pole: complex) -> float:
         power = (np.abs(self.unstacked(residual)) ** 2).mean(axis=(0, 1))
         nearest = int(np.argmin(np.abs(self.omega - pole.imag)))
-        return local_noise_ratio(power, nearest, LINES.beside) * self._window_gain(-pole.real)
+        return local_noise_ratio(power, nearest, LINES.noise_lines) * self._window_gain(-pole.real)
 
     def _window_gain(self, rate: float) -> float:
         """Power of windowed noise in the impulse response of a pole over that of stationary noise."""
@@ -231,8 +232,8 @@ def window_rate(residual: np.ndarray, omega: np.ndarray) -> float:
     model = power @ np.exp(-2j * np.pi * np.outer(instants, lags)) / power.sum(axis=1, keepdims=True)
     misfit = np.linalg.norm(correlation - np.pi / 4.0 * model * hyp2f1(0.5, 0.5, 2.0, np.abs(model) ** 2), axis=1)
     best = int(np.argmin(misfit))
-    significant = misfit[0] - misfit[best] > LINES.windowed / np.sqrt(omega.size)
-    is_found = significant and misfit[best] < LINES.explained * misfit[0]
+    significant = misfit[0] - misfit[best] > LINES.window_deviations / np.sqrt(omega.size)
+    is_found = significant and misfit[best] < LINES.max_deviation_share * misfit[0]
     return float(WINDOWS[best] * step.mean() / (2.0 * np.pi)) if is_found else 0.0
 
 
@@ -253,7 +254,7 @@ def relative_noise(lines: Lines, fit: Fit) -> np.ndarray | None:
     nonzero = np.median(differences, axis=(1, 2)) > 0.0  # an output of zeros has no noise
     if not nonzero.any():
         return None
-    smoothed = median_filter(np.abs(fitted + residual), (1, 1, LINES.smoothed))
+    smoothed = median_filter(np.abs(fitted + residual), (1, 1, LINES.median_lines))
     size, differences = np.maximum(np.abs(fitted), smoothed)[nonzero], differences[nonzero]
     logs = np.log(np.maximum(differences, 1e-3 * np.median(differences, axis=-1, keepdims=True) + 1e-300))
     levels = _reference_levels(logs)[..., None] * np.ones(omega.size)
@@ -276,7 +277,7 @@ def _reference_levels(logs: np.ndarray) -> np.ndarray:
     """Log level of each reference relative to its output, (n_outputs, n_references); 0 where levels may be equal."""
     levels = np.median(logs, axis=-1)
     levels -= levels.mean(axis=1, keepdims=True)
-    differ = [len(rows) > 1 and kruskal(*rows).pvalue < LINES.uneven for rows in logs]
+    differ = [len(rows) > 1 and kruskal(*rows).pvalue < LINES.uneven_probability for rows in logs]
     return np.where(np.array(differ)[:, None], levels, 0.0)
 
 
@@ -290,7 +291,7 @@ def _frequency_trend(logs: np.ndarray, size: np.ndarray, omega: np.ndarray, inne
     fit = least_squares(lambda c: powers[inner] @ c - y, np.zeros(LINES.degree + 1), loss="soft_l1", f_scale=y.std())
     trend = powers @ fit.x
     between, within = np.var(trend[inner]), np.var(y - trend[inner])
-    if f.sf(between / LINES.degree * free / max(within, 1e-300), LINES.degree, free) > LINES.uneven:
+    if f.sf(between / LINES.degree * free / max(within, 1e-300), LINES.degree, free) > LINES.uneven_probability:
         return np.zeros(omega.size)
     return np.asarray(trend - trend.mean())
 
@@ -300,7 +301,8 @@ def _response_trend(logs: np.ndarray, size: np.ndarray, omega: np.ndarray, inner
     log_levels = np.zeros(size.shape)
     for j, (log_noise, size_of_output) in enumerate(zip(logs, size[..., inner], strict=True)):
         typical = float(np.median(size_of_output))
-        if spearmanr(log_noise.ravel(), size_of_output.ravel(), alternative="greater").pvalue > LINES.uneven:
+        ranks = spearmanr(log_noise.ravel(), size_of_output.ravel(), alternative="greater")
+        if ranks.pvalue > LINES.uneven_probability:
             continue
         # Least absolute deviations of log s: the few lines of a mode not yet fitted count little.
         remaining = [log_noise - 0.5 * np.log1p((share * size_of_output / typical) ** 2) for share in SHARES]

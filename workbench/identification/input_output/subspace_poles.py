@@ -21,13 +21,13 @@ from workbench.records.record import Record
 class SubspaceSettings:
     """Constants of the initial subspace model."""
 
-    horizon: int = 140  # samples of past and of future, at most
-    rows_each: int = 5  # samples of nonzero input for each row of the data matrix, at least
-    least: int = 6  # samples of past at least: with fewer, impacts excite too few directions of the state space
+    max_horizon: int = 140  # samples of past and of future, at most
+    samples_per_row: int = 5  # samples of nonzero input for each row of the data matrix, at least
+    min_horizon: int = 6  # samples of past at least: with fewer, impacts excite too few directions of the state space
     # rows and columns of the data matrix at most: more add time, and the poles are only initial
-    most_rows: int = 20_000
-    most_columns: int = 1_700
-    regularised: float = 1e-12  # of each row's energy, against singularity by dependent rows
+    max_rows: int = 20_000
+    max_columns: int = 1_700
+    regularisation: float = 1e-12  # of each row's energy, against singularity by dependent rows
 
 
 SUBSPACE = SubspaceSettings()
@@ -42,22 +42,22 @@ def subspace_poles(records: Sequence[Record], delays: np.ndarray, order: int) ->
     rows_per_lag = 2 * (m + q)
     longest = max(record.n_samples for record in records) - int(delays.max(initial=0))
     horizon = min(
-        SUBSPACE.horizon,
-        SUBSPACE.most_columns // rows_per_lag,
-        n_moving(records) // (SUBSPACE.rows_each * rows_per_lag),
+        SUBSPACE.max_horizon,
+        SUBSPACE.max_columns // rows_per_lag,
+        n_moving(records) // (SUBSPACE.samples_per_row * rows_per_lag),
         longest // 4,
     )
-    if horizon < SUBSPACE.least:
+    if horizon < SUBSPACE.min_horizon:
         return np.zeros(0, complex)
     gram = np.zeros((rows_per_lag * horizon, rows_per_lag * horizon))
-    columns_left = SUBSPACE.most_rows
+    columns_left = SUBSPACE.max_rows
     for record in records:
         data = _data_matrix(record, delays, horizon, columns_left)
         gram += data @ data.T
         columns_left -= data.shape[1]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
     gram *= np.outer(scale, scale)
-    gram[np.diag_indices_from(gram)] += SUBSPACE.regularised
+    gram[np.diag_indices_from(gram)] += SUBSPACE.regularisation
     try:
         factor = np.linalg.cholesky(gram)
         n_future_inputs, n_known = q * horizon, (m + 2 * q) * horizon

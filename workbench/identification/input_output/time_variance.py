@@ -46,14 +46,16 @@ from workbench.structure.printed import mode_text
 class ChangingSettings:
     """Constants of the search for modes that change within a record."""
 
-    sure: float = 5.0  # standard errors that a change must exceed
-    near: float = 3.0  # half-power bandwidths: two modes closer than this may be one changing mode
-    instead: float = 0.5  # share of the χ² of the second mode that a change of the first must explain to replace it
-    matters: float = 0.1  # of the half-power bandwidth: a smaller change is negligible
-    reach: float = 0.15  # of the frequency of a mode, within which weaker modes may model its change or distortion
-    faint: float = 0.2  # of its statistic, below which a mode is such a weaker one
-    collinear: float = 1e-4  # singular value of columns of unit length, above which they count
-    faded: float = 4.0  # time constants of a mode in the record, above which the first-order formula holds
+    standard_errors: float = 5.0  # that a change must exceed
+    max_distance: float = 3.0  # half-power bandwidths: two modes closer than this may be one changing mode
+    # share of the χ² of the second mode that a change of the first must explain to replace it
+    min_explained_share: float = 0.5
+    min_change: float = 0.1  # of the half-power bandwidth: a smaller change is negligible
+    # of the frequency of a mode, within which weaker modes may model its change or distortion
+    frequency_range: float = 0.15
+    faint_ratio: float = 0.2  # of its statistic, below which a mode is such a weaker one
+    min_singular_value: float = 1e-4  # of columns of unit length: above, they count
+    min_time_constants: float = 4.0  # of a mode in the record, above which the first-order formula holds
 
 
 CHANGING = ChangingSettings()
@@ -89,8 +91,8 @@ def changes_in_time(data: KnownInputs, fit: Fit) -> Change:
     change, deviation = inverse @ right_side, np.sqrt(np.diag(inverse))
     omega, span = np.abs(poles), 2.0 * np.pi / data.resolution
     size, error = np.abs(change[n:]), deviation[n:]
-    sure = (size > CHANGING.sure * error) & (size > CHANGING.matters * np.abs(poles.real))
-    sure &= -poles.real * span > CHANGING.faded
+    sure = (size > CHANGING.standard_errors * error) & (size > CHANGING.min_change * np.abs(poles.real))
+    sure &= -poles.real * span > CHANGING.min_time_constants
     return Change(change[n:] / omega, error / omega, sure)
 
 
@@ -115,7 +117,7 @@ def joined(data: KnownInputs, fit: Fit, time_limit: TimeLimit) -> Fit:
         one = settled(data, only(data, fit, np.delete(np.arange(fit.poles.size), weak)), time_limit=time_limit)
         change, at = changes_in_time(data, one), strong - (weak < strong)
         statistic = (change.frequency[at] / change.deviation[at]) ** 2
-        if change.sure[at] and statistic > CHANGING.instead * added_misfit(one, fit, one.noise):
+        if change.sure[at] and statistic > CHANGING.min_explained_share * added_misfit(one, fit, one.noise):
             return joined(data, one, time_limit)
     return fit
 
@@ -133,11 +135,11 @@ def beside_changing(
         return _with_competing_models(data, fit, limit, time_limit, linear)
     strength = statistic_of_each(fit)
     participation = fit.participation[:, : data.n_inputs].T
-    alike = mac(fit.amplitudes, fit.amplitudes) * mac(participation, participation) > COMPETING.alike
+    alike = mac(fit.amplitudes, fit.amplitudes) * mac(participation, participation) > COMPETING.min_mac
     motions, changing, removed = list[Floats](), list[complex](), np.zeros(fit.poles.size, bool)
     for r in np.argsort(-strength):
-        weak = strength < CHANGING.faint * strength[r]
-        close = np.abs(fit.poles.imag - fit.poles.imag[r]) < CHANGING.reach * np.abs(fit.poles.imag[r])
+        weak = strength < CHANGING.faint_ratio * strength[r]
+        close = np.abs(fit.poles.imag - fit.poles.imag[r]) < CHANGING.frequency_range * np.abs(fit.poles.imag[r])
         others = np.flatnonzero(weak & close & alike[r] & ~removed)
         if removed[r] or not others.size or time_limit.spent(CHANGE_CHECK):
             continue
@@ -147,13 +149,13 @@ def beside_changing(
         motion = _motion(data, one.poles[at], one.participation[at])
         decrease = added_misfit(one, fit, fit.noise)
         phi = columns(data, one.poles, one.participation)[0]
-        if _explained(data, one, phi, motion, fit.noise) > CHANGING.instead * decrease:
+        if _explained(data, one, phi, motion, fit.noise) > CHANGING.min_explained_share * decrease:
             motions.append(motion)
             changing.append(complex(one.poles[at]))
             removed[others] = True
     if not motions:
         return None
-    data = data.with_columns(orthonormal_basis(np.hstack(motions), CHANGING.collinear), tuple(changing))
+    data = data.with_columns(orthonormal_basis(np.hstack(motions), CHANGING.min_singular_value), tuple(changing))
     return data, only(data, fit, ~removed)
 
 
@@ -162,7 +164,7 @@ def _with_competing_models(
 ) -> tuple[KnownInputs, Fit] | None:
     """`beside_changing` for one input and one output, where shapes tell nothing: the likelier model is kept."""
     omega = fit.poles.imag
-    close = np.abs(np.subtract.outer(omega, omega)) < CHANGING.reach * omega[:, None]
+    close = np.abs(np.subtract.outer(omega, omega)) < CHANGING.frequency_range * omega[:, None]
     rows_of = cache(lambda data: regressors(data, fit.poles, fit.participation))
 
     def alternative_of(data: KnownInputs, cluster: np.ndarray) -> tuple[KnownInputs, complex] | None:
@@ -176,7 +178,7 @@ def _motion(data: KnownInputs, pole: complex, participation: np.ndarray) -> Floa
     terms = data.rows_of([_series(z, pole, data.dt) for z in data.modal_coordinate(pole, participation)])
     terms = normalised_columns(terms)
     q = np.linalg.qr(data.fixed)[0]
-    return orthonormal_basis(terms - q @ (q.T @ terms), CHANGING.collinear)
+    return orthonormal_basis(terms - q @ (q.T @ terms), CHANGING.min_singular_value)
 
 
 def _series(z: np.ndarray, pole: complex, dt: float) -> Floats:
@@ -218,9 +220,9 @@ def _explained(data: KnownInputs, fit: Fit, phi: Floats, further: Floats, noise:
 
 def _pairs_alike(fit: Fit) -> list[tuple[int, int]]:
     """Pairs of close modes with similar shapes, the closest first."""
-    poles, alike = fit.poles, mac(fit.amplitudes, fit.amplitudes) > COMPETING.alike
+    poles, alike = fit.poles, mac(fit.amplitudes, fit.amplitudes) > COMPETING.min_mac
     distance = np.abs(np.subtract.outer(poles.imag, poles.imag))
-    close = distance < CHANGING.near * np.add.outer(np.abs(poles.real), np.abs(poles.real))
+    close = distance < CHANGING.max_distance * np.add.outer(np.abs(poles.real), np.abs(poles.real))
     pairs = zip(*np.nonzero(np.triu(alike & close, 1)), strict=True)
     return sorted(((int(r), int(s)) for r, s in pairs), key=lambda pair: distance[pair])
 
@@ -240,7 +242,7 @@ def change_remarks(
         return (), ()
     change = changes_in_time(data, fit)
     names = named_near(fit, fit.poles)
-    sure = change.sure & (np.abs(change.frequency) < CHANGING.reach) & ~np.isin(fit.poles, named)
+    sure = change.sure & (np.abs(change.frequency) < CHANGING.frequency_range) & ~np.isin(fit.poles, named)
     linear = [f"{names[r]} by about {100 * change.frequency[r]:+.1g} %" for r in np.flatnonzero(sure).tolist()]
     others = [r for r in named_near(fit, changing) if not sure[r] and fit.poles[r] not in named]
     each = (
