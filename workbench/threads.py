@@ -38,8 +38,8 @@ def cores() -> int:
 def at_once(function: Callable[[Item], R], items: Iterable[Item], *, long: bool = True) -> list[R]:
     """`function(item)` of each item, in their order, on all cores, where the function releases Python's lock.
 
-    Only within `one_blas_thread`; elsewhere, within such a function, and where each does not take `long` beside the
-    0.1 ms in which a thread takes it up, one after the other.
+    One after the other outside `one_blas_thread`, within such a function, and unless each is `long`: well over the
+    0.1 ms that it takes to start a thread on it.
     """
     at_hand = list(items)
     pool = None if not long or len(at_hand) < 2 or is_piece() else _LIMIT.pool()

@@ -301,7 +301,7 @@ def test_what_is_wrong_is_refused_by_name(tmp_path, case, points, words):
 
 
 def test_a_faulty_name_in_the_table_of_points_is_refused_with_its_place_once(tmp_path):
-    with pytest.raises(CaseError, match=r"^(?!.*points\.csv.*points\.csv).*points\.csv, line 3, column 'name'"):
+    with pytest.raises(CaseError, match=r"^(?!.*points\.csv.*points\.csv).*points\.csv, line 3: name must be"):
         read_case(written(tmp_path, FRAME, POINTS.replace("a.y,1", ",1")))
 
 

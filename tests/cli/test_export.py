@@ -73,6 +73,17 @@ def test_a_controller_is_told_in_the_units_of_the_case(run, rig, tmp_path):
         assert told in header
 
 
+def test_rates_and_delays_of_a_controller_are_in_the_units_of_time_of_the_case(run, rig, tmp_path):
+    """The same numbers of a case in seconds and of one in milliseconds."""
+    said = {}
+    for time, names in {"s": "", "ms": '[units]\nlength = "m"\nmass = "kg"\ntime = "ms"\nforce = "MN"\n'}.items():
+        rig.write_text(RIG + names)
+        said[time] = run("export", rig, "--rate-hz", 100, "--to", tmp_path / f"{time}.py").output
+    assert "at 100 Hz" in said["s"] and "frequency [Hz]" in said["s"] and " ms\n" in said["s"]
+    assert "at 100 1/ms" in said["ms"] and "frequency [1/ms]" in said["ms"]
+    assert " Hz" not in said["ms"] and "1/s" not in said["ms"]
+
+
 @pytest.mark.parametrize(("law", "asked"), [("poles", 0.3), ("imsc", 0.7)])
 def test_the_damping_that_a_law_gives_is_told(run, rig, tmp_path, law, asked):
     """With R = 1 / (2 ζ² ω²) of IMSC and x² = 1 + 2 ζ²: 4 ζ_c² x = 4 ζ_0² + 2 ζ² + 2 (x - 1) (near ζ)."""

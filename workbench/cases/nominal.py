@@ -272,7 +272,7 @@ def _patch(entry: dict[str, Any], at: Place, where: str) -> Actuator:
     if entry.get("quantity", "moment") != "moment":
         raise CaseError(f"{where}: a patch acts by moments along its edges; leave quantity out")
     on_plate = isinstance(at, tuple)
-    length: Any = tuple(numbers(entry, "patch", where, 2)) if on_plate else number(entry, "patch", where)
+    length: Any = tuple(numbers(entry, "patch", where, 2).tolist()) if on_plate else number(entry, "patch", where)
     axis = entry.get("axis")
     if axis not in (None, "x", "y"):
         raise CaseError(f"{where}: axis is x or y, or left out for moments about both; got {shown(axis)}")

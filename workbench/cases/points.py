@@ -44,9 +44,7 @@ def read_points(path: Path, n_modes: int) -> tuple[NamedPoints, np.ndarray]:
     values = np.array([[_number(path, i, row, c) for c in numeric] for i, row in rows])
     names, directions, nodes = (
         tuple(
-            ""
-            if column == "direction" and row[column] == ""
-            else text(row, column, f"{path}, line {i + 2}, column {column!r}")
+            "" if column == "direction" and row[column] == "" else text(row, column, f"{path}, line {i + 2}")
             for i, row in rows
         )
         for column in ("name", "direction", "node")

@@ -221,4 +221,4 @@ def _value(value: Any) -> str:
         return "{" + ", ".join(f"{key} = {_value(item)}" for key, item in value.items()) + "}"
     if isinstance(value, str):
         value = "".join(c if c.isprintable() else " " for c in value)
-    return json.dumps(value, ensure_ascii=False, default=float)
+    return json.dumps(value, ensure_ascii=False, allow_nan=False, default=float)

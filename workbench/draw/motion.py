@@ -39,6 +39,7 @@ def response_motion(
         responses: by the displayed name; all with the same time axis and number of modes.
         colours: of responses by name; None for the first of several in grey.
         length, time: the units of x and of the time axis.
+
     Raises:
         ValueError: different time axes, or named points without positions.
     """

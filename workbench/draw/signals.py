@@ -13,6 +13,7 @@ from workbench.identification.signal.distortion import Distortion
 from workbench.identification.signal.frequency_responses import FrfEstimate
 from workbench.records.frequency_responses import FrequencyResponses
 from workbench.records.record import Channel, Record
+from workbench.records.units import SI, Units
 
 SEGMENT_SAMPLES = 4096  # at most
 SHOWN = 1e-12  # least power that is drawn, over the largest
@@ -209,7 +210,7 @@ def _per_input(unit: str, of_inputs: Sequence[str]) -> str:
     return f"{top}/{over}" if len(set(of_inputs)) == 1 else f"{unit} per unit of input"
 
 
-def plot_distortion(distortions: Sequence[Distortion]) -> Figure:
+def plot_distortion(distortions: Sequence[Distortion], units: Units = SI) -> Figure:
     """Excited lines, odd and even lines that are not excited, and noise; a column per record, a row per output."""
     rows = distortions[0].channels[:OUTPUTS_SHOWN]
     shared = {"sharex": True, "sharey": "row", "squeeze": False}
@@ -224,7 +225,7 @@ def plot_distortion(distortions: Sequence[Distortion]) -> Figure:
                     ax.semilogy(at, size, ".", color=colour, markersize=3, label=label)
             ax.semilogy(found.frequencies_hz[shown], found.noise[j, shown], color=GREY, linewidth=0.8, label="noise")
         column[0].set_title(found.name)
-        column[-1].set_xlabel("frequency [Hz]")
+        column[-1].set_xlabel(f"frequency [{units.named('Hz')}]")
     for ax, channel in zip(axes[:, 0], rows, strict=True):
         ax.set_ylabel(in_units(channel.name, channel.unit and f"{channel.unit} rms"))
     lowest = min(float(np.median(found.noise[found.noise > 0])) for found in distortions if (found.noise > 0).any())

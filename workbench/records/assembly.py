@@ -50,7 +50,7 @@ class Description(NamedTuple):
     channels: Mapping[str, Mapping[str, Any]]  # by signal: kind, name, quantity, unit, at, noise_std, as far as given
     name: str | None = None  # of the record; None where only channels are described
     sampling: tuple[float, float] | None = None  # (start, step), s; None where the file has times alone
-    input_hold: str = "zero"
+    input_hold: str = "zero"  # "zero", "first" or "band-limited"
 
 
 def record_of(

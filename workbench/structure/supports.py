@@ -81,10 +81,10 @@ def _named(name: str, named: Mapping[str, Support], allowed: tuple[str, ...], wh
 
 
 def support_text(support: End | Edge, allowed: tuple[str, ...]) -> str:
-    """Text of an end or an edge: its name among those that the structure has, or its stiffnesses."""
+    """Text of an end or an edge: its name, those that the structure has first, or its stiffnesses."""
     named, *units = (NAMED_EDGES, "N/m²", "N") if isinstance(support, Edge) else (NAMED_ENDS, "N/m", "N m")
     springs = f"on springs of {support.translation:g} {units[0]} and {support.rotation:g} {units[1]}"
-    return next((name for name in allowed if named[name] == support), springs)
+    return next((name for name in (*allowed, *named) if named[name] == support), springs)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 from workbench.cases.case import Case, read_case
 from workbench.cases.writing import write_case
 from workbench.gap.diagnose_case import diagnose_case
-from workbench.renamed import Renamed
+from workbench.renamed import former_fields
 from workbench.trials.imperfections import CLEAN, IMPERFECTIONS, INDISTINGUISHABLE, SIZES, TRIPLE
 from workbench.trials.make import KINDS, OUTSIDE_KINDS, check_kinds, find_trial_with_plant
 from workbench.trials.rigs import FRAMES, MEMBERS, PLATES
@@ -144,6 +144,7 @@ def write_trials(
     labels.write_text(json.dumps(labelled, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
+@former_fields(tally="statistics")
 @dataclass(frozen=True, eq=False)
 class Trials:
     """The results of blind trials.
@@ -160,8 +161,6 @@ class Trials:
     imperfect_scores: dict[str, dict[str, Any]]
     statistics: Statistics
 
-    tally = Renamed("statistics")
-
 
 def verdict_on(folder: Path) -> dict[str, Any]:
     """The verdict on a case folder, as JSON, by one process."""
@@ -172,7 +171,7 @@ def hold_trials(
     n: int,
     seed: int,
     *,
-    diagnose_case: Callable[[Path], dict[str, Any]] = verdict_on,
+    diagnose_case: Callable[[Path], dict[str, Any]] | None = None,
     report: Callable[[str, float], None] = lambda text, share: None,
     **hidden: Any,
 ) -> Trials:
@@ -182,7 +181,7 @@ def hold_trials(
     contains no labels.
 
     Args:
-        diagnose_case: folder -> verdict as JSON.
+        diagnose_case: folder -> verdict as JSON; None for the diagnosis of this package.
         report: called with (text, share done).
         hidden: `like`, `structure`, `kinds`, `imperfections` and `size` of `write_trials`.
     """
@@ -194,7 +193,7 @@ def hold_trials(
         verdicts, scores, imperfect = {}, {}, {}
         folders = sorted(Path(cases).iterdir())
         for i, folder in enumerate(folders):
-            verdicts[folder.name] = diagnose_case(folder)
+            verdicts[folder.name] = (diagnose_case or verdict_on)(folder)
             report(f"diagnosed {folder.name}", 0.1 + 0.9 * (i + 1) / n)
         for folder in folders:
             pair, domain = (verdicts[folder.name], labels[folder.name]), read_case(folder).rig.modes.domain

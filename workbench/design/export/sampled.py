@@ -82,26 +82,31 @@ class SampledDesign(Printed):
         return command_words(self.modes.domain, self.source.law.actuators, self.units)
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
-        late = f", computation delay {1e3 * self.computing_delay:.4g} ms" if self.computing_delay else ""
-        line = f"{self.controller.name} at {self.sample_rate_hz:.6g} Hz{late}"
+        hz = self.units.named("Hz")
+        late = f", computation delay {self._duration(self.computing_delay)}" if self.computing_delay else ""
+        line = f"{self.controller.name} at {self.sample_rate_hz:.6g} {hz}{late}"
         own = self.source.law.controlled
         rows = [
             (str(r + 1), f"{f:.5g}", f"{self.sample_rate_hz / f:.3g}" if f else "", f"{np.degrees(lag):.3g}")
             for r, f, lag in zip(own, self.modes.frequencies_hz[list(own)], self.phase_lag)
         ]
-        return line, ("mode", "frequency [Hz]", "samples per period", "phase lag [°]"), rows, self.remarks
+        return line, ("mode", f"frequency [{hz}]", "samples per period", "phase lag [°]"), rows, self.remarks
+
+    def _duration(self, time: float) -> str:
+        return f"{1e3 * time:.3g} ms" if self.units == SI else f"{time:.3g} {self.units.time}"
 
     @property
     def remarks(self) -> tuple[str, ...]:
         """Stability before and after sampling, rigid modes that are not held, and modes that are aliased."""
         before = close_with(self.modes, self.source)
-        delay = f"delay margin {1e3 * self.delay_margin:.3g} ms"
+        delay = f"delay margin {self._duration(self.delay_margin)}"
         if not np.isfinite(self.delay_margin):
             delay = f"delay margin beyond {MOST_LATE} samples"
         # a decay rate within rounding is stated as zero
         own = 0.0 if abs(self.decay_rate) * self.controller.sample_time < ON_CIRCLE else self.decay_rate
         continuous = 0.0 if stability(before.poles) == "marginally stable" else before.decay_rate
-        remarks = [f"decay rate {own:.3g} 1/s, {continuous:.3g} 1/s in continuous time; {delay}"]
+        per_time, hz = self.units.named("1/s"), self.units.named("Hz")
+        remarks = [f"decay rate {own:.3g} {per_time}, {continuous:.3g} {per_time} in continuous time; {delay}"]
         rate, law = self.sample_rate_hz, self.source.law
         free = [r for i, r in enumerate(law.controlled) if self.modes.omega[r] == 0 and not law.gain[:, i].any()]
         if free:
@@ -113,8 +118,8 @@ class SampledDesign(Printed):
             r, f = folded[0]
             more = f", and {len(folded) - 1} more above it" if len(folded) > 1 else ""
             remarks.append(
-                f"mode {r + 1} at {f:.4g} Hz{more}: above the Nyquist frequency, aliased to"
-                f" {abs(f - rate * round(f / rate)):.4g} Hz; add an anti-aliasing filter, or sample faster"
+                f"mode {r + 1} at {f:.4g} {hz}{more}: above the Nyquist frequency, aliased to"
+                f" {abs(f - rate * round(f / rate)):.4g} {hz}; add an anti-aliasing filter, or sample faster"
             )
         return tuple(remarks)
 

@@ -12,7 +12,7 @@ from workbench.design.estimation.controller import check_readable
 from workbench.design.estimation.digital import DigitalController
 from workbench.design.loop.closed_loop import Response
 from workbench.design.loop.loop_steps import ControllerArrays, loop_record
-from workbench.renamed import Renamed, former_fields
+from workbench.renamed import former_fields
 from workbench.rig.actuators import Actuator, mixing
 from workbench.rig.elements import PeriodicForce, RandomForce
 from workbench.rig.rig import Rig, participation_of, shape_of
@@ -71,6 +71,7 @@ class LoopTest:
         return self.sample_time * np.arange(self.n_samples)
 
 
+@former_fields(into="participation")
 @dataclass(frozen=True, eq=False)
 class LoopRun:
     """The response of a rig under a controller.
@@ -88,8 +89,6 @@ class LoopRun:
     elements: np.ndarray
     bounded: bool
     participation: np.ndarray
-
-    into = Renamed("participation")
 
     def __post_init__(self) -> None:
         freeze(self, "commands", "elements", "participation")

@@ -176,7 +176,7 @@ def _each_parameter(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
         "stiffness": [f"stiffness_{k}" for k in range(waves if along else 0)],
         "mass": [f"mass_{k}" for k in range(waves)],
         "frequency": [f"frequency_{r}" for r in modes if rig.modes.omega[r - 1] > 0],
-        "coupling": [name for name, *_ in _couplings(rig.modes.omega.tobytes())],
+        "coupling": [name for name, *_ in _couplings(rig.modes.omega.tobytes())] if prior.coupling else [],
         "damping": [f"damping_{r}" for r in modes],
     }
     yield from (with_prior(name) for group in names if getattr(prior, group) for name in names[group])

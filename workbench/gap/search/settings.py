@@ -206,8 +206,8 @@ class JointSettings:
     )
     # likewise of damping, with errors of each mode: a guess is wrong by a factor of two
     max_guessed_damping: float = 0.6
-    # share of the widest that nominal errors of a careful laboratory keep within; if they are larger, an effect that
-    # makes them smaller is named even though the residual is small
+    # share of `max_prior_std` that nominal errors of a careful laboratory keep within; if they are larger, an effect
+    # that makes them smaller is named even though the residual is small
     plausible_share: float = 0.95
     # standard deviations below which a smaller one no longer shortens the description
     negligible_std: tuple[tuple[str, float], ...] = (
@@ -224,13 +224,16 @@ class JointSettings:
     )
     residual_nats: float = 300.0  # description length, nats, of a factor e in the residual power above the noise
     final_waves: int = 13  # cosines of a profile error in the last fit, so that intervals allow for short waves
-    min_prior_share: float = 1e-3  # smallest prior standard deviation, of the widest: zero would not be differentiable
+    min_prior_share: float = (
+        1e-3  # smallest prior standard deviation, of `max_prior_std`: zero would not be differentiable
+    )
     rounds: int = 4  # updates of the prior variances; those after a large decrease of the cost do not count
     max_rounds: int = 12  # likewise, those included
     large_decrease: float = 0.3  # residual power over that of the round before: a smaller ratio is a large decrease
     # nominal errors: sensitivities to fewer are always taken anew; kept ones took a servo's friction for a damper
     few_errors: int = 16
-    # relative decrease of the residual power below which the rounds end; likewise in the last fit
+    # relative decrease of the residual power below which the rounds end, or the alternation with the fit of a random
+    # force; likewise in the last fit
     round_tolerance: float = 0.02
     final_round_tolerance: float = 1e-3
     max_fits_ahead: int = 4  # fits to one-step-ahead predictions, each with new sensitivities
@@ -269,7 +272,7 @@ class StepwiseSettings:
     saved_nats_beside_plausible: float = 10.0
     # likewise, beyond which it need not be likelier than errors that over-fit: where nothing hides 10 and 19 were
     # saved, by masses and losses of stiffness 34 to 39
-    saved_nats_alone: float = 25.0
+    saved_nats_decisive: float = 25.0
     singles: int = 3  # single effects that are tried as the first
     max_effects: int = 4  # effects of a set; no case of the format has more than three
     # share of the residual power above the noise, with nominal errors alone, that the first effect must remove. On
@@ -339,7 +342,9 @@ class IntervalSettings:
     model_difference: float = 1e-4
     most_leverage: float = 0.5  # bound of the leverage of a block on a direction that no other block determines
     blocks: int = 12  # of a record: longer than the correlation of the residual, and enough to estimate its scatter
-    prior_share: float = 0.5  # of the widest: size of a careful model's nominal errors where the records do not show it
+    prior_share: float = (
+        0.5  # of `max_prior_std`: size of a careful model's nominal errors where the records do not show it
+    )
     prior_weight: float = 2.0  # errors of a group that this prior size weighs as much as
     rounds: int = 20  # updates of the prior sizes towards their fixed point
     draws: int = 48  # of input noise: the standard error of a standard deviation from 48 draws is a tenth

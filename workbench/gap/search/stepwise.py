@@ -381,7 +381,7 @@ class Stepwise:
             likelier = partial(is_likelier, self.search, step, least=SEARCH.least_gain)
             # errors iterated that far over-fit: an effect that saves much need not be likelier than those
             return saved > STEPWISE.saved_nats_beside_plausible and (
-                likelier(converged) or (saved > STEPWISE.saved_nats_alone and likelier(errors_only))
+                likelier(converged) or (saved > STEPWISE.saved_nats_decisive and likelier(errors_only))
             )
 
         found = [s for s in shorter if is_found(s)]

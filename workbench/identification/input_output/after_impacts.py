@@ -72,7 +72,7 @@ class AfterImpacts:
 
 
 def after_impacts(records: Sequence[Record], time_limit: TimeLimit) -> AfterImpacts:
-    """The amplitude-dependent modes, where every record, zero between impacts, ends in free decay; none otherwise."""
+    """The amplitude-dependent modes, where every record, its inputs zero between impacts, ends in free decay."""
     decays = [decay for record in records if (decay := _free_decay(record))]
     if len(decays) < len(records):
         return AfterImpacts()

@@ -75,7 +75,7 @@ class SelectedModes:
     statistic: np.ndarray  # (n_modes,) χ² of each mode
     limit: float  # threshold of this χ², exceeded by noise alone with the chance of a false alarm
     full: bool  # whether the selection stopped at the maximum number of modes
-    distorted: tuple[complex, ...] = ()  # nonlinear modes, near which modes that do not predict others were removed
+    distorted: tuple[complex, ...] = ()  # poles near which modes that do not predict held-out data were removed
 
     def refitted(self, fit: Fit) -> "SelectedModes":
         """The same selection with another fit, and the statistic of each mode in that fit."""

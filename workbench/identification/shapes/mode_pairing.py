@@ -45,7 +45,7 @@ class ModePairing(Printed):
 def repeated_modes(omega: np.ndarray, repeated: float = 1e-3) -> np.ndarray:
     """Cluster number of each mode, (n_modes,), equal for repeated modes.
 
-    Their frequencies `omega`, which must not decrease, step by less than a share `repeated` from one to the next.
+    Their frequencies `omega`, which must not decrease, step by at most a share `repeated` from one to the next.
     """
     return np.cumsum(np.r_[False, np.diff(omega) > repeated * np.maximum(omega[1:], 1e-300)])
 

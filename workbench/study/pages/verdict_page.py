@@ -62,7 +62,7 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
         seen = "Spectra of the records: excited lines, odd and even lines that are not excited, and noise."
         if all(d.parity_resolved for d in distortions):
             seen += " Only odd lines are excited, so even ones reveal an even nonlinearity."
-        blocks.append(block(plot_distortion(distortions), seen))
+        blocks.append(block(plot_distortion(distortions, verdict.units), seen))
     if verdict.shows_gap:
         modes = {"nominal": nominal, **({fitted: corrected} if changed and fitted in rigs else {})}
         blocks += moving_modes(verdict.nominal, modes, units=verdict.units)
