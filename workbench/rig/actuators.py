@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from workbench.arrays import Floats
-from workbench.renamed import Renamed, former_arguments
+from workbench.renamed import Renamed, former_fields
 from workbench.structure.domain import Between, Location, Patch, Place, PlaceError, centred_at, same_place
 from workbench.structure.printed import Constructed
 
 
+@former_fields(kind="quantity")
 @dataclass(frozen=True, repr=False)
 class Actuator(Constructed):
     """An actuator that exerts a force or a moment.
@@ -56,7 +57,7 @@ class Actuator(Constructed):
     shape_error: tuple[float, ...] = ()
     crosstalk: tuple[tuple[str, float], ...] = ()
 
-    kind, linear = Renamed("quantity"), Renamed("has_state_space")
+    linear = Renamed("has_state_space")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "at", same_place(self.at))
@@ -85,9 +86,6 @@ class Actuator(Constructed):
         """Whether the force is a linear function of the command with finitely many states, so without a delay."""
         unbounded = np.isinf(self.limit) and np.isinf(self.rate_limit)
         return bool(unbounded and not (self.dead_zone or self.delay or self.hysteresis_share or self.bias))
-
-
-Actuator.__init__ = former_arguments(kind="quantity")(Actuator.__init__)  # type: ignore[method-assign]
 
 
 def mixed(actuators: Sequence[Actuator], commands: Floats) -> Floats:

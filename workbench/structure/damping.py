@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from workbench.renamed import Renamed, former_arguments
+from workbench.renamed import former_fields
 from workbench.structure.profile import ProfileLike
 
 
@@ -24,6 +24,7 @@ class ModalDamping:
         return np.diag(2.0 * of_mode * omega)
 
 
+@former_fields(g1="stiffness", g2="mass")
 @dataclass(frozen=True)
 class ProportionalDamping:
     """Rayleigh damping C = α M + β K: c_r = α + β ω_r², ζ_r = (α/ω_r + β ω_r)/2; g2 and g1 of (2.13).
@@ -36,16 +37,9 @@ class ProportionalDamping:
     stiffness: float = 0.0
     mass: float = 0.0
 
-    g1, g2 = Renamed("stiffness"), Renamed("mass")
-
     def matrix(self, omega: np.ndarray) -> np.ndarray:
         """c_rs = (α + β ω_r²) δ_rs, (n_modes, n_modes)."""
         return np.diag(self.stiffness * omega**2 + self.mass)
-
-
-ProportionalDamping.__init__ = former_arguments(  # type: ignore[method-assign]
-    g1="stiffness", g2="mass"
-)(ProportionalDamping.__init__)
 
 
 @dataclass(frozen=True, eq=False)
